@@ -1,0 +1,317 @@
+"""The values that flow through the algorithm: immutable, checked when made.
+
+Pixels are (x, y) with COLMAP's corner origin: the centre of the first pixel is (0.5, 0.5). The suffixes 0 and 1 name
+the two images of a pair. Points are full-image pixels unless a name says `crop`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int32, UInt8
+
+from sgam_core.errors import ShapeError
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Box:
+    """A half-open rectangle [x0, x1) x [y0, y1) in pixels."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    def __post_init__(self) -> None:
+        if not (self.x0 < self.x1 and self.y0 < self.y1):
+            raise ShapeError(f"box [{self.x0}, {self.x1}) x [{self.y0}, {self.y1}) is empty; expected x0 < x1, y0 < y1")
+
+    @property
+    def width(self) -> float:
+        return self.x1 - self.x0
+
+    @property
+    def height(self) -> float:
+        return self.y1 - self.y0
+
+    @property
+    def area(self) -> float:
+        return self.width * self.height
+
+    @property
+    def center(self) -> tuple[float, float]:
+        return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
+
+    def enlarged(self, factor: float) -> Box:
+        """This box, `factor` times as wide and as high about the same centre."""
+        (x, y), w, h = self.center, self.width * factor / 2, self.height * factor / 2
+        return Box(x0=x - w, y0=y - h, x1=x + w, y1=y + h)
+
+    def times(self, sx: float, sy: float) -> Box:
+        """This box in the pixels of an image that is sx times as wide and sy times as high."""
+        return Box(x0=self.x0 * sx, y0=self.y0 * sy, x1=self.x1 * sx, y1=self.y1 * sy)
+
+    def contains(self, points: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, " N"]:
+        """Which of the points (N, 2) lie inside."""
+        x, y = points[:, 0], points[:, 1]
+        inside: np.ndarray = (x >= self.x0) & (x < self.x1) & (y >= self.y0) & (y < self.y1)
+        return inside
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Image:
+    """One image as the algorithm sees it.
+
+    name: its key in caches and messages. pixels: (H, W, 3) RGB. mask: (H, W), True where matches are wanted.
+    camera_matrix: (3, 3) pinhole matrix, corner origin, when the focal length is known.
+    """
+
+    name: str
+    pixels: UInt8[np.ndarray, "H W 3"]
+    mask: Bool[np.ndarray, "H W"] | None = None
+    camera_matrix: Float[np.ndarray, "3 3"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.pixels.ndim != 3 or self.pixels.shape[2] != 3 or self.pixels.dtype != np.uint8:
+            raise ShapeError(
+                f"image '{self.name}' is {self.pixels.dtype} {self.pixels.shape}; expected uint8 (height, width, 3) RGB"
+            )
+        if self.mask is not None and self.mask.shape != self.pixels.shape[:2]:
+            raise ShapeError(
+                f"mask of '{self.name}' is {self.mask.shape[0]}x{self.mask.shape[1]} but the image is "
+                f"{self.height}x{self.width} (height x width); a mask has the image's own size"
+            )
+
+    @property
+    def width(self) -> int:
+        return int(self.pixels.shape[1])
+
+    @property
+    def height(self) -> int:
+        return int(self.pixels.shape[0])
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Crop:
+    """A window of an image, resized for a point matcher.
+
+    window: whole pixels inside the image. size: (width, height) in the matcher's pixels. The resize is isotropic up to
+    the rounding of `size`; `crop_from_image` is the exact affine map of what `pixels` returns.
+    """
+
+    image: Image
+    window: Box
+    size: tuple[int, int]
+
+    @property
+    def key(self) -> tuple[str, float, float, float, float, int, int]:
+        """Equal for crops with equal content: what a matcher may cache features by, within one collection."""
+        return (self.image.name, self.window.x0, self.window.y0, self.window.x1, self.window.y1, *self.size)
+
+    @property
+    def scale(self) -> float:
+        """Matcher pixels per image pixel."""
+        return min(self.size[0] / self.window.width, self.size[1] / self.window.height)
+
+    @property
+    def crop_from_image(self) -> Float[np.ndarray, "2 3"]:
+        """Affine map (2, 3) from image to crop pixels: s * (p - origin)."""
+        sx, sy = self.size[0] / self.window.width, self.size[1] / self.window.height
+        return np.array([[sx, 0.0, -sx * self.window.x0], [0.0, sy, -sy * self.window.y0]])
+
+    def to_image(self, points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
+        """Crop pixels (N, 2) to image pixels."""
+        affine = self.crop_from_image
+        image_points: np.ndarray = (points - affine[:, 2]) / affine[[0, 1], [0, 1]]
+        return image_points
+
+    def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The crop's own pixels (h, w, 3) RGB."""
+        return _resize(self._cut(self.image.pixels), self.size, smooth=True)
+
+    def mask(self) -> Bool[np.ndarray, "h w"] | None:
+        """The crop's mask (h, w), True where matches are wanted; None when the image has none."""
+        if self.image.mask is None:
+            return None
+        return _resize(self._cut(self.image.mask).astype(np.uint8), self.size, smooth=False).astype(bool)
+
+    def _cut(self, array: np.ndarray) -> np.ndarray:
+        w = self.window
+        return array[int(w.y0) : int(w.y1), int(w.x0) : int(w.x1)]
+
+
+def _resize(array: np.ndarray, size: tuple[int, int], *, smooth: bool) -> np.ndarray:
+    if size == (array.shape[1], array.shape[0]):
+        return np.ascontiguousarray(array)
+    shrinks = size[0] < array.shape[1] or size[1] < array.shape[0]
+    method = cv2.INTER_NEAREST_EXACT if not smooth else cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return cv2.resize(array, size, interpolation=method)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Matches:
+    """Point matches of two images, or of two crops when a point matcher returns them.
+
+    points0, points1: (M, 2) pixels. scores: (M,) in [0, 1]. sigmas0, sigmas1: (M,) image pixels per matcher pixel, the
+    resolution at which each side was matched (1 when left out). area_index: (M,) row in the pair's areas, -1 for the
+    whole image.
+    """
+
+    points0: Float[np.ndarray, "M 2"]
+    points1: Float[np.ndarray, "M 2"]
+    scores: Float[np.ndarray, " M"]
+    sigmas0: Float[np.ndarray, " M"] = field(default=None)  # type: ignore[assignment]
+    sigmas1: Float[np.ndarray, " M"] = field(default=None)  # type: ignore[assignment]
+    area_index: Int32[np.ndarray, " M"] = field(default=None)  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        count = len(self.points0)
+        filled = {
+            "points0": np.asarray(self.points0, np.float64),
+            "points1": np.asarray(self.points1, np.float64),
+            "scores": np.asarray(self.scores, np.float32),
+            "sigmas0": np.ones(count, np.float32) if self.sigmas0 is None else np.asarray(self.sigmas0, np.float32),
+            "sigmas1": np.ones(count, np.float32) if self.sigmas1 is None else np.asarray(self.sigmas1, np.float32),
+            "area_index": np.full(count, -1, np.int32)
+            if self.area_index is None
+            else np.asarray(self.area_index, np.int32),
+        }
+        for name, array in filled.items():
+            expected = (count, 2) if name.startswith("points") else (count,)
+            if array.shape != expected:
+                raise ShapeError(f"{name} of matches has shape {array.shape}; expected {expected}")
+            object.__setattr__(self, name, array)
+
+    def __len__(self) -> int:
+        return len(self.points0)
+
+    @property
+    def sigmas(self) -> Float[np.ndarray, " M"]:
+        """(M,) the coarser side of each match: what residuals are divided by."""
+        return np.maximum(self.sigmas0, self.sigmas1)
+
+    def select(self, rows: np.ndarray) -> Matches:
+        """The given rows (indices or a mask), in their order."""
+        return Matches(**{name: getattr(self, name)[rows] for name in _MATCH_FIELDS})
+
+    def swapped(self) -> Matches:
+        """The same matches with the two images exchanged."""
+        return replace(
+            self, points0=self.points1, points1=self.points0, sigmas0=self.sigmas1, sigmas1=self.sigmas0
+        )
+
+    @staticmethod
+    def empty() -> Matches:
+        return Matches(points0=np.zeros((0, 2)), points1=np.zeros((0, 2)), scores=np.zeros(0))
+
+    @staticmethod
+    def concatenate(parts: Sequence[Matches]) -> Matches:
+        if not parts:
+            return Matches.empty()
+        return Matches(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in _MATCH_FIELDS})
+
+
+_MATCH_FIELDS = ("points0", "points1", "scores", "sigmas0", "sigmas1", "area_index")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Area:
+    """A region of one image that can be matched as a whole.
+
+    kind: `object` (SOA), `intersection` (SIA), or what another area matcher calls its own. label: the object's label,
+    None where the area holds several.
+    """
+
+    box: Box
+    kind: str
+    label: int | None = None
+
+
+class AreaState(StrEnum):
+    """What became of an area match."""
+
+    KEPT = "kept"  # its point matches are in the result
+    REJECTED = "rejected"  # GR found it inconsistent with the two-view geometry
+    UNRESOLVED = "unresolved"  # doubtful, and GP could not or did not choose it
+    SKIPPED = "skipped"  # never matched: a limit of the options was reached
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class AreaMatch:
+    """Two areas that may show the same thing, and what the later stages said of them.
+
+    distance: of their descriptors. predicted: chosen by GP among doubtful areas. scale0, scale1: matcher pixels per
+    image pixel of the two crops (0 before they are cropped). num_matches, num_inliers: point matches inside, and those
+    consistent with the pair's geometry.
+    """
+
+    area0: Area
+    area1: Area
+    distance: float
+    predicted: bool = False
+    state: AreaState = AreaState.KEPT
+    reason: str = ""
+    scale0: float = 0.0
+    scale1: float = 0.0
+    num_matches: int = 0
+    num_inliers: int = 0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PutativeAreas:
+    """What an area matcher proposes: certain matches, and groups of doubtful candidates that exclude each other.
+
+    notes: limits that were reached, for the report.
+    """
+
+    confident: tuple[AreaMatch, ...] = ()
+    doubtful: tuple[tuple[AreaMatch, ...], ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class TwoViewModel:
+    """Robust epipolar geometry of a pair.
+
+    F: (3, 3) maps image-0 points to image-1 lines, full-image pixels. calibrated: came from an essential matrix.
+    num_inliers of num_matches; planarity: share of the inliers that a single homography explains as well (near 1 the
+    geometry is unstable when not calibrated).
+    """
+
+    F: Float[np.ndarray, "3 3"]
+    calibrated: bool
+    num_inliers: int
+    num_matches: int
+    planarity: float
+
+    @property
+    def inlier_ratio(self) -> float:
+        return self.num_inliers / max(self.num_matches, 1)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class PairResult:
+    """Everything that is known of a pair after matching.
+
+    matches: in the image's own pixels. areas: every area match with its state and reason. two_view: the consensus
+    geometry, None when there is none. coverage0, coverage1: share of each image inside kept areas. whole_scale0,
+    whole_scale1: matcher pixels per image pixel of plain whole-image matching at the same options. fallback: why the
+    whole images were matched instead of areas, empty when areas were used. notes: limits that were reached.
+    pixels_matched: sum over both sides of every point-matcher call. seconds: by stage.
+    """
+
+    matches: Matches
+    areas: tuple[AreaMatch, ...]
+    two_view: TwoViewModel | None
+    coverage0: float
+    coverage1: float
+    whole_scale0: float
+    whole_scale1: float
+    fallback: str = ""
+    notes: tuple[str, ...] = ()
+    pixels_matched: int = 0
+    seconds: Mapping[str, float] = field(default_factory=dict)

@@ -1,0 +1,1 @@
+"""SGAM over image collections, into COLMAP."""

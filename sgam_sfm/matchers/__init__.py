@@ -1,0 +1,1 @@
+"""Point matchers, one adapter a file."""

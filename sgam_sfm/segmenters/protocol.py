@@ -1,0 +1,25 @@
+"""What a segmenter is: label maps for a whole collection, in one label space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Int32
+
+from sgam_sfm.images import ImageFile
+
+
+class Segmenter(Protocol):
+    """Gives every image of a collection a label map; equal labels mean the same thing in all of them."""
+
+    def segment(
+        self, images: Sequence[ImageFile], advance: Callable[[float], None]
+    ) -> Iterator[tuple[ImageFile, Int32[np.ndarray, "H W"] | Exception]]:
+        """Yield (image, labels) for every image, in order; an image that fails yields its error in place of labels.
+
+        labels: int32, 0 = void; any size with the image's aspect. `advance(share)` is called as work is done; the
+        shares add up to len(images).
+        """
+        ...
