@@ -164,13 +164,13 @@ class Matches:
     points0: Float[np.ndarray, "M 2"]
     points1: Float[np.ndarray, "M 2"]
     scores: Float[np.ndarray, " M"]
-    sigmas0: Float[np.ndarray, " M"] = field(default=None)  # type: ignore[assignment]
-    sigmas1: Float[np.ndarray, " M"] = field(default=None)  # type: ignore[assignment]
-    area_index: Int32[np.ndarray, " M"] = field(default=None)  # type: ignore[assignment]
+    sigmas0: Float[np.ndarray, " M"] = field(default=None)  # type: ignore[arg-type]
+    sigmas1: Float[np.ndarray, " M"] = field(default=None)  # type: ignore[arg-type]
+    area_index: Int32[np.ndarray, " M"] = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         count = len(self.points0)
-        filled = {
+        filled: dict[str, np.ndarray] = {
             "points0": np.asarray(self.points0, np.float64),
             "points1": np.asarray(self.points1, np.float64),
             "scores": np.asarray(self.scores, np.float32),
@@ -200,9 +200,7 @@ class Matches:
 
     def swapped(self) -> Matches:
         """The same matches with the two images exchanged."""
-        return replace(
-            self, points0=self.points1, points1=self.points0, sigmas0=self.sigmas1, sigmas1=self.sigmas0
-        )
+        return replace(self, points0=self.points1, points1=self.points0, sigmas0=self.sigmas1, sigmas1=self.sigmas0)
 
     @staticmethod
     def empty() -> Matches:
