@@ -1,0 +1,243 @@
+"""A2PM: any area matcher and any point matcher become one matcher (paper, Sec. III-A and III-D)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int32, UInt8
+
+from sgam_core.collection import collect, coverage, merge
+from sgam_core.crops import area_crop, whole_crop
+from sgam_core.geometry import estimate_two_view
+from sgam_core.options import CropOptions, SGAMOptions
+from sgam_core.prediction import MatchedArea, predict
+from sgam_core.protocols import AreaMatcher, PointMatcher
+from sgam_core.rejection import reject
+from sgam_core.semantic import SemanticAreaMatcher
+from sgam_core.types import AreaMatch, AreaState, Crop, Image, Matches, PairResult, PutativeAreas
+
+
+def match_pair(
+    image0: UInt8[np.ndarray, "H W 3"],
+    image1: UInt8[np.ndarray, "I V 3"],
+    labels0: Int32[np.ndarray, "h w"],
+    labels1: Int32[np.ndarray, "i v"],
+    point_matcher: PointMatcher,
+    options: SGAMOptions | None = None,
+    *,
+    camera0: Float[np.ndarray, "3 3"] | None = None,
+    camera1: Float[np.ndarray, "3 3"] | None = None,
+    mask0: Bool[np.ndarray, "H W"] | None = None,
+    mask1: Bool[np.ndarray, "I V"] | None = None,
+) -> PairResult:
+    """Match two images by their semantic areas.
+
+    Args: image0, image1 (H, W, 3) uint8 RGB; labels0, labels1 integer label maps in one label space, 0 = void, of any
+        size with the image's aspect; point_matcher, see `PointMatcher`; camera0, camera1 (3, 3) pinhole matrices,
+        corner origin, when known; mask0, mask1 (H, W), True where matches are wanted.
+    Returns: matches in full-image pixels (corner origin), areas with their state, the two-view geometry.
+    Raises: ShapeError for arrays of another shape or type.
+    """
+    options = options or SGAMOptions()
+    area_matcher = SemanticAreaMatcher(options=options.semantic)
+    first = Image(name="0", pixels=image0, mask=mask0, camera_matrix=camera0)
+    second = Image(name="1", pixels=image1, mask=mask1, camera_matrix=camera1)
+    described = (
+        area_matcher.describe(first, np.asarray(labels0, np.int32)),
+        area_matcher.describe(second, np.asarray(labels1, np.int32)),
+    )
+    return match_described(first, second, *described, area_matcher, point_matcher, options)
+
+
+def match_described(
+    image0: Image,
+    image1: Image,
+    description0: Any,
+    description1: Any,
+    area_matcher: AreaMatcher,
+    point_matcher: PointMatcher,
+    options: SGAMOptions,
+) -> PairResult:
+    """The whole algorithm for two images whose areas have been described: SAM, PM, GP, GR, GMC."""
+    points = _Points(image0, image1, point_matcher, options.crop)
+    estimate = partial(
+        estimate_two_view, camera0=image0.camera_matrix, camera1=image1.camera_matrix, options=options.geometry
+    )
+    clock = _Clock(points)
+
+    putative = area_matcher.match(description0, description1, points.whole)
+    clock.lap("area matching")
+    confident, doubtful = points.inside(putative, options.prediction.max_candidates)
+    clock.lap("crops")
+    areas = [*confident, *predict(confident, doubtful, estimate, options.geometry, options.prediction)]
+    clock.lap("GP")
+    verdict = reject(areas, points.whole, points.whole_is_known, estimate, options.geometry, options.rejection)
+    clock.lap("GR")
+    kept = [area for area in verdict.areas if area.area.state is AreaState.KEPT and not verdict.fallback]
+    shares = [
+        coverage([getattr(area.area, side).box for area in kept], image.width, image.height)
+        for side, image in (("area0", image0), ("area1", image1))
+    ]
+    if verdict.fallback:
+        matches = points.whole()
+        model = estimate(matches)
+    else:
+        inside = [
+            replace(area.matches, area_index=np.full(len(area.matches), index, np.int32))
+            for index, area in enumerate(verdict.areas)
+            if area.area.state is AreaState.KEPT
+        ]
+        collected = collect(inside, min(shares), verdict.model, points.whole, options.collection)
+        matches, model = merge(inside, collected, options.collection), verdict.model
+    clock.lap("GMC")
+    whole_scales = [whole_crop(image, options.crop).scale for image in (image0, image1)]
+    return PairResult(
+        matches=matches,
+        areas=tuple(_final(area.area, verdict.fallback) for area in verdict.areas),
+        two_view=model,
+        coverage0=shares[0],
+        coverage1=shares[1],
+        whole_scale0=whole_scales[0],
+        whole_scale1=whole_scales[1],
+        fallback=verdict.fallback,
+        notes=putative.notes + points.notes,
+        pixels_matched=points.pixels,
+        seconds=clock.seconds,
+    )
+
+
+class WholeImages:
+    """The area matcher `none`: proposes no area, so that the point matcher sees whole images. The baseline."""
+
+    def describe(self, image: Image, labels: Int32[np.ndarray, "H W"] | None) -> None:
+        """Nothing to describe."""
+
+    def match(self, description0: None, description1: None, match_whole: Callable[[], Matches]) -> PutativeAreas:
+        """No areas."""
+        return PutativeAreas()
+
+
+def _final(area: AreaMatch, fallback: str) -> AreaMatch:
+    """Areas that were fine themselves but whose pair fell back."""
+    if fallback and area.state is AreaState.KEPT:
+        return replace(area, state=AreaState.REJECTED, reason=f"pair fell back: {fallback}")
+    return area
+
+
+class _Points:
+    """The point matcher's calls for one pair: whole images at most once, areas in one batch."""
+
+    def __init__(self, image0: Image, image1: Image, matcher: PointMatcher, options: CropOptions) -> None:
+        self.images, self.matcher, self.options = (image0, image1), matcher, options
+        self.pixels = 0
+        self.seconds = 0.0
+        self.notes: tuple[str, ...] = ()
+        self._whole: Matches | None = None
+
+    @property
+    def whole_is_known(self) -> bool:
+        return self._whole is not None
+
+    def whole(self) -> Matches:
+        """Plain matches of the whole images, computed at the first call."""
+        if self._whole is None:
+            crop0, crop1 = (whole_crop(image, self.options) for image in self.images)
+            self._whole = self._match([(crop0, crop1)])[0]
+        return self._whole
+
+    def inside(self, putative: PutativeAreas, max_candidates: int) -> tuple[list[MatchedArea], list[list[MatchedArea]]]:
+        """Point matches inside all confident areas and the doubtful candidates that the limits allow."""
+        limited = _limit_candidates(putative.doubtful, max_candidates)
+        planned = [*putative.confident, *(candidate for group in limited for candidate in group)]
+        crops = [
+            (area_crop(self.images[0], a.area0.box, self.options), area_crop(self.images[1], a.area1.box, self.options))
+            for a in planned
+        ]
+        chosen = self._within_budget(planned, crops)
+        found = dict(zip(chosen, self._match([crops[k] for k in chosen]), strict=True))
+        areas = iter([self._matched(area, crops[k], found.get(k)) for k, area in enumerate(planned)])
+        confident = [next(areas) for _ in putative.confident]
+        return confident, [[next(areas) for _ in group] for group in limited]
+
+    def _within_budget(self, planned: Sequence[AreaMatch], crops: Sequence[tuple[Crop, Crop]]) -> list[int]:
+        """Rows to match: in order, until the pixel budget is spent."""
+        budget = self.options.max_crop_pixels or float("inf")
+        spent, rows = 0, []
+        for k, (area, pair) in enumerate(zip(planned, crops, strict=True)):
+            if area.state is AreaState.SKIPPED:
+                continue
+            cost = sum(crop.size[0] * crop.size[1] for crop in pair)
+            if spent + cost <= budget:
+                spent += cost
+                rows.append(k)
+        waiting = sum(area.state is not AreaState.SKIPPED for area in planned) - len(rows)
+        if waiting:
+            self.notes += (f"{waiting} area matches beyond the pixel budget (max_crop_pixels)",)
+        return rows
+
+    def _matched(self, area: AreaMatch, crops: tuple[Crop, Crop], found: Matches | None) -> MatchedArea:
+        scales = {"scale0": crops[0].scale, "scale1": crops[1].scale}
+        if found is None:
+            reason = area.reason or "beyond the pixel budget (max_crop_pixels)"
+            skipped = replace(area, state=AreaState.SKIPPED, reason=reason, **scales)  # type: ignore[arg-type]
+            return MatchedArea(area=skipped, matches=Matches.empty())
+        inside = area.area0.box.enlarged(self.options.keep).contains(found.points0)
+        inside &= area.area1.box.enlarged(self.options.keep).contains(found.points1)
+        matches = found.select(inside)
+        counted = replace(area, num_matches=len(matches), **scales)  # type: ignore[arg-type]
+        return MatchedArea(area=counted, matches=matches)
+
+    def _match(self, crops: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
+        """Run the point matcher and bring its points to image pixels."""
+        if not crops:
+            return []
+        self.pixels += sum(crop.size[0] * crop.size[1] for pair in crops for crop in pair)
+        start = time.perf_counter()
+        matched = self.matcher.match(crops)
+        self.seconds += time.perf_counter() - start
+        return [
+            Matches(
+                points0=crop0.to_image(found.points0),
+                points1=crop1.to_image(found.points1),
+                scores=found.scores,
+                sigmas0=found.sigmas0 / np.float32(crop0.scale),
+                sigmas1=found.sigmas1 / np.float32(crop1.scale),
+            )
+            for (crop0, crop1), found in zip(crops, matched, strict=True)
+        ]
+
+
+def _limit_candidates(groups: Sequence[Sequence[AreaMatch]], max_candidates: int) -> list[list[AreaMatch]]:
+    """The groups with the candidates beyond the limit marked as skipped, the farthest in descriptor distance first."""
+    distances = sorted((c.distance, g, k) for g, group in enumerate(groups) for k, c in enumerate(group))
+    dropped = {(g, k) for _, g, k in distances[max_candidates:]}
+    reason = "GP: limit of candidate pairs (max_candidates)"
+    return [
+        [replace(c, state=AreaState.SKIPPED, reason=reason) if (g, k) in dropped else c for k, c in enumerate(group)]
+        for g, group in enumerate(groups)
+    ]
+
+
+class _Clock:
+    """Seconds by stage; the point matcher's are told apart, whichever stage called it."""
+
+    def __init__(self, points: _Points) -> None:
+        self._points = points
+        self._last = self._now()
+        self.seconds: dict[str, float] = {}
+
+    def lap(self, stage: str) -> None:
+        """What passed since the last lap belongs to the stage."""
+        now = self._now()
+        self.seconds[stage] = now - self._last
+        self.seconds["point matching"] = self._points.seconds
+        self._last = now
+
+    def _now(self) -> float:
+        """Time not spent in the point matcher."""
+        return time.perf_counter() - self._points.seconds
