@@ -108,10 +108,10 @@ def detect_intersection_areas(
     return tuple(
         IntersectionArea(
             box=Box(
-                x0=x[k] * CELL_PX,
-                y0=y[k] * CELL_PX,
-                x1=min((x[k] + side) * CELL_PX, counts.width),
-                y1=min((y[k] + side) * CELL_PX, counts.height),
+                x0=float(x[k] * CELL_PX),
+                y0=float(y[k] * CELL_PX),
+                x1=float(min((x[k] + side) * CELL_PX, counts.width)),
+                y1=float(min((y[k] + side) * CELL_PX, counts.height)),
             ),
             proportions=proportions,
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int32
@@ -11,6 +11,7 @@ from jaxtyping import Int32
 from sgam_core.types import Crop, Image, Matches, PutativeAreas
 
 
+@runtime_checkable
 class PointMatcher(Protocol):
     """Finds point matches between two crops (PM in the paper)."""
 
@@ -24,6 +25,7 @@ class PointMatcher(Protocol):
         ...
 
 
+@runtime_checkable
 class AreaMatcher(Protocol):
     """Finds areas of two images that show the same thing (AM in the paper)."""
 

@@ -77,7 +77,7 @@ def _consensus(
     if model is None:
         return list(candidates), None, "no two-view geometry from the areas' matches"
     ratio = float((residuals(model.F, pool) <= geometry.max_residual).mean()) if len(pool) else 0.0
-    if ratio < options.min_pool_inlier_ratio:
+    if ratio < options.min_pool_inlier_ratio and not single:
         low = f"{ratio:.2f} of the areas' matches agree on one geometry, below {options.min_pool_inlier_ratio:.2f}"
         return list(candidates), model, low
     return [_judge(candidate, model, geometry, options) for candidate in candidates], model, ""

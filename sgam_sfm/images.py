@@ -2,8 +2,47 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
+import os
+import struct
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int32, UInt8
+from PIL import ExifTags, UnidentifiedImageError
+from PIL import Image as PillowImage
+
+from sgam_core.errors import InputError
+
+_COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".pbm", ".pnm", ".tga"})
+# COLMAP does not read these: listed too, so that a later step can name them in place of silently passing them over.
+_OTHER_SUFFIXES = frozenset({".webp", ".gif", ".jp2", ".heic", ".heif", ".avif", ".jxl"})
+
+# Pillow applies the orientation of TIFF files (and of no other format) when it decodes them: this undoes it.
+_UPRIGHT_TO_STORED = {
+    2: PillowImage.Transpose.FLIP_LEFT_RIGHT,
+    3: PillowImage.Transpose.ROTATE_180,
+    4: PillowImage.Transpose.FLIP_TOP_BOTTOM,
+    5: PillowImage.Transpose.TRANSPOSE,
+    6: PillowImage.Transpose.ROTATE_90,
+    7: PillowImage.Transpose.TRANSVERSE,
+    8: PillowImage.Transpose.ROTATE_270,
+}
+# Pillow spreads the values of grey PNGs of 2 and 4 bits over 0..255: right for images, wrong for ids.
+_GREY_STEP = {"L;2": 85, "L;4": 17}
+# All that Pillow's decoders are known to raise on broken files.
+_DECODE_ERRORS = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    struct.error,
+    zlib.error,
+    PillowImage.DecompressionBombError,
+)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -18,3 +57,148 @@ class ImageFile:
     width: int
     height: int
     digest: str
+
+
+def list_images(folder: Path) -> tuple[tuple[str, ...], int]:
+    """Names of the images in a folder and its sub-folders, sorted, and how many other files were passed over.
+
+    Hidden files and folders (a leading dot) are neither listed nor counted.
+    Raises: InputError when the folder is missing, cannot be read, or holds no image.
+    """
+    if not folder.is_dir():
+        what = "is a file" if folder.exists() else "does not exist"
+        raise InputError(f"image folder '{folder}' {what}; give the folder that holds the images")
+    names: list[str] = []
+    num_others = 0
+    for parent, folders, files in os.walk(folder, onerror=_refuse_folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for file in files:
+            path = Path(parent, file)
+            if file.startswith("."):
+                continue
+            if path.suffix.lower() in _COLMAP_SUFFIXES | _OTHER_SUFFIXES:
+                names.append(path.relative_to(folder).as_posix())
+            else:
+                num_others += 1
+    if not names:
+        raise InputError(
+            f"image folder '{folder}' holds no image ({num_others} other files); expected jpg, png, tif, bmp or ppm"
+        )
+    return tuple(sorted(names)), num_others
+
+
+def inspect_image(folder: Path, name: str) -> ImageFile:
+    """Decode an image once to know its size, that it is whole, and the digest of its content.
+
+    Raises: InputError when the file is missing, truncated, broken, or of a kind that cannot be decoded.
+    """
+    path = folder / name
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"image '{name}' cannot be read from '{folder}' ({_reason(error)}); check the name") from error
+    height, width = _rgb(_decode(data, name), name).shape[:2]
+    return ImageFile(name=name, path=path, width=width, height=height, digest=hashlib.sha256(data).hexdigest())
+
+
+def read_image(file: ImageFile | Path) -> UInt8[np.ndarray, "H W 3"]:
+    """The pixels of an image, RGB; grey is repeated, alpha dropped, 16 bits reduced to 8.
+
+    Raises: InputError when the file is missing, truncated, broken, or of a kind that cannot be decoded.
+    """
+    path, name = (file.path, file.name) if isinstance(file, ImageFile) else (file, file.name)
+    return _rgb(_decode(_read(path, "image"), name), name)
+
+
+def read_mask(mask_folder: Path, image: ImageFile) -> Bool[np.ndarray, "H W"] | None:
+    """The mask of an image by COLMAP's convention: `<name>.png` (a PNG may keep its own name), where 0 = ignore.
+
+    Returns: (H, W), True where matches are wanted; None when the image has no mask.
+    Raises: InputError when the mask is broken or of another size than the image.
+    """
+    path = mask_folder / f"{image.name}.png"
+    if not path.exists() and image.name.lower().endswith(".png"):
+        path = mask_folder / image.name
+    if not path.exists():
+        return None
+    picture = _decode(_read(path, "mask"), str(path))
+    one_channel = picture.mode in ("1", "L", "I", "F") or picture.mode.startswith("I;16")
+    mask = np.asarray(picture if one_channel else picture.convert("L")) != 0
+    if mask.shape != (image.height, image.width):
+        raise InputError(
+            f"mask of '{image.name}' is {mask.shape[0]}x{mask.shape[1]} but the image is "
+            f"{image.height}x{image.width} (height x width); make it again from this image"
+        )
+    return mask
+
+
+def read_label_map(path: Path) -> Int32[np.ndarray, "H W"]:
+    """The ids of a label map: a PNG of one channel, 8 or 16 bits; of a palette PNG the indices, not the colours.
+
+    Raises: InputError when the file is missing or broken, or holds colours in place of ids.
+    """
+    picture = _decode(_read(path, "label map"), str(path))
+    if not (picture.mode in ("1", "L", "P", "I") or picture.mode.startswith("I;16")):
+        raise InputError(
+            f"label map '{path}' has the colours of a picture (mode {picture.mode}); expected one channel of ids, "
+            "8 or 16 bits or a palette; export the ids"
+        )
+    return np.asarray(picture).astype(np.int32) // picture.info.get("grey_step", 1)
+
+
+def _refuse_folder(error: OSError) -> None:
+    raise InputError(f"folder '{error.filename}' cannot be read ({_reason(error)}); check its permissions") from error
+
+
+def _read(path: Path, what: str) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{what} '{path}' cannot be read ({_reason(error)}); check the name") from error
+
+
+def _decode(data: bytes, name: str) -> PillowImage.Image:
+    try:
+        picture: PillowImage.Image = PillowImage.open(io.BytesIO(data))
+        grey_step = _GREY_STEP.get(_raw_mode(picture), 1)
+        orientation = picture.getexif().get(ExifTags.Base.Orientation) if picture.format == "TIFF" else None
+        picture.load()
+    except _DECODE_ERRORS as error:
+        raise InputError(
+            f"'{name}' cannot be decoded ({_reason(error)}); copy it again from its source, convert it to JPEG or PNG, "
+            "or remove it"
+        ) from error
+    if orientation in _UPRIGHT_TO_STORED:
+        picture = picture.transpose(_UPRIGHT_TO_STORED[orientation])
+    picture.info["grey_step"] = grey_step
+    return picture
+
+
+def _raw_mode(picture: PillowImage.Image) -> str:
+    """How a PNG stores its pixels, known only until it is decoded."""
+    tiles = getattr(picture, "tile", [])
+    return str(tiles[0].args) if picture.format == "PNG" and tiles else ""
+
+
+def _rgb(picture: PillowImage.Image, name: str) -> UInt8[np.ndarray, "H W 3"]:
+    if picture.mode == "I" or picture.mode.startswith("I;16"):
+        grey = np.asarray(picture).astype(np.int64)
+        if grey.min() >= 0 and grey.max() <= 65535:
+            return np.repeat(((grey + 128) // 257).astype(np.uint8)[:, :, None], 3, axis=2)
+    if picture.mode in ("I", "F"):
+        raise InputError(f"'{name}' has 32-bit pixels; expected 8 or 16 bits a channel: convert it to PNG")
+    if picture.mode in ("P", "PA"):
+        picture = picture.convert("RGBA")
+    try:
+        return np.array(picture.convert("RGB"))
+    except ValueError as error:
+        raise InputError(f"'{name}' has the colour mode {picture.mode}; convert it to RGB, as JPEG or PNG") from error
+
+
+def _reason(error: BaseException) -> str:
+    """One line for an exception of a library, without addresses of objects or paths named elsewhere."""
+    if isinstance(error, UnidentifiedImageError):
+        return "not an image of a known format"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return " ".join(str(error).split()) or type(error).__name__

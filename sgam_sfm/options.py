@@ -1,0 +1,182 @@
+"""The options of a run: defaults, then a preset, then a file, then flags; what a run was made with, as JSON."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_type_hints
+
+import tyro
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import to_jsonable_python
+
+from sgam_core import PRESETS, SGAMOptions
+from sgam_core.errors import OptionError, SGAMError
+from sgam_core.options import (
+    CollectionOptions,
+    CropOptions,
+    GeometryOptions,
+    PredictionOptions,
+    RejectionOptions,
+    SemanticOptions,
+)
+from sgam_sfm.keypoints import KeypointOptions
+
+_STAGES = tuple(stage.name for stage in fields(SGAMOptions))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchOptions:
+    """From photos to a COLMAP model, matching by semantic areas (SGAM).
+
+    Reads --images, matches the pairs, writes OUT/database.db and OUT/sparse/0. The same command started again
+    continues where it stopped.
+    """
+
+    images: Path
+    """Folder of photos; sub-folders are searched too."""
+    output: Path
+    """Folder for all results; made when missing."""
+    pairs: Path | None = None
+    """Text file with `nameA nameB` a line (a tab between names with spaces). Without it: all pairs, up to 60 images."""
+    config: Path | None = None
+    """TOML or JSON file with any of these options (an options.json of an earlier run is one); flags win over it."""
+    preset: Literal["default", "paper", "scannet", "outdoor"] = "default"
+    """Values of the algorithm's options below; --config and flags win over it."""
+
+    matcher: str = "xfeat-star"
+    """Point matcher: xfeat-star, coarse-loftr, or one that another package installs."""
+    weights: Path | None = None
+    """File with the point matcher's weights, where it does not find its own."""
+    area_matcher: str = "sgam"
+    """sgam: semantic areas. none: the point matcher on whole images, the baseline."""
+    segmenter: str = "coseg"
+    """Who makes label maps: coseg learns regions from the collection itself, without a list of classes."""
+    num_labels: int = 0
+    """Regions that coseg looks for (0: as many as are stable over seeds)."""
+    labels: Path | None = None
+    """Folder of label maps made elsewhere, <name>.png with ids of 8 or 16 bits; wins over --segmenter."""
+    mask_path: Path | None = None
+    """COLMAP's mask folder, <name>.png with 0 where nothing is to be matched."""
+
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP's camera model."""
+    camera_params: str = ""
+    """Its parameters, comma-separated (PINHOLE: fx,fy,cx,cy); held fixed in mapping."""
+    camera_mode: Literal["auto", "single", "per-folder", "per-image"] = "auto"
+    """Which images share a camera."""
+    cameras: Path | None = None
+    """Parameters for each image: a COLMAP model, or lines `name MODEL width height params...` (`*`: all images)."""
+    refine_intrinsics: bool = False
+    """Let mapping refine parameters that were given explicitly."""
+    mapper: Literal["incremental", "global"] = "incremental"
+    """COLMAP's incremental mapper, or its global one (GLOMAP)."""
+    mapping: bool = True
+    """Make a model; --no-mapping stops after the geometric verification."""
+
+    device: str = "auto"
+    """auto, cpu, cuda, cuda:1, ..."""
+    threads: int = 0
+    """CPU threads (0: all cores)."""
+    seed: int = 0
+    """Seed of everything random."""
+    verbose: bool = False
+    """Show the log on the terminal; it is always in OUT/log.txt."""
+
+    crop: Annotated[CropOptions, tyro.conf.arg(prefix_name=False)] = field(default_factory=CropOptions)
+    """Crops for the point matcher."""
+    semantic: SemanticOptions = field(default_factory=SemanticOptions)
+    """SAM: areas and their matching."""
+    geometry: GeometryOptions = field(default_factory=GeometryOptions)
+    """Robust epipolar geometry."""
+    prediction: PredictionOptions = field(default_factory=PredictionOptions)
+    """GP: doubtful areas."""
+    rejection: RejectionOptions = field(default_factory=RejectionOptions)
+    """GR: wrong areas."""
+    collection: CollectionOptions = field(default_factory=CollectionOptions)
+    """GMC: matches of the whole images."""
+    keypoints: KeypointOptions = field(default_factory=KeypointOptions)
+    """Merging the points of all pairs into keypoints."""
+
+    @property
+    def sgam(self) -> SGAMOptions:
+        """The options of the core."""
+        stages = SGAMOptions(**{stage: getattr(self, stage) for stage in _STAGES})
+        return replace(stages, geometry=replace(stages.geometry, seed=self.seed))
+
+
+NOT_IN_RESULTS = frozenset(
+    {"output", "config", "threads", "verbose", "refine_intrinsics", "mapper", "mapping", "keypoints"}
+)
+"""Options that the raw results of pairs do not follow from: a run can be continued with others."""
+
+
+def with_preset(options: MatchOptions, preset: str) -> MatchOptions:
+    """The options with the algorithm's values of a preset.
+
+    Raises: OptionError for an unknown preset.
+    """
+    if preset not in PRESETS:
+        raise OptionError(f"preset '{preset}' is unknown; known: {', '.join(PRESETS)}")
+    stages = {stage: getattr(PRESETS[preset], stage) for stage in _STAGES}
+    return replace(options, preset=preset, **stages)
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """A TOML or JSON file of options.
+
+    Raises: OptionError when it is missing or neither.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
+    except (OSError, ValueError) as error:
+        raise OptionError(f"--config '{path}' cannot be used ({error}); expected a TOML or JSON file") from error
+    if not isinstance(content, dict):
+        raise OptionError(f"--config '{path}' holds a {type(content).__name__}; expected options by name")
+    return content
+
+
+def merged(options: Any, changes: Mapping[str, Any], where: str = "") -> Any:
+    """A copy of a dataclass with the values of a (nested) mapping; `-` and `_` in names are one.
+
+    Raises: OptionError for an unknown name or a value of the wrong type.
+    """
+    types = get_type_hints(type(options))
+    values: dict[str, Any] = {}
+    for key, value in changes.items():
+        name = key.replace("-", "_")
+        if name not in types:
+            near = difflib.get_close_matches(name, types, n=1)
+            hint = f"; did you mean '{where}{near[0]}'?" if near else ""
+            raise OptionError(f"option '{where}{key}' is unknown{hint}")
+        current = getattr(options, name, None)
+        if is_dataclass(current) and isinstance(value, Mapping):
+            values[name] = merged(current, value, f"{where}{key}.")
+            continue
+        try:
+            values[name] = TypeAdapter(types[name]).validate_python(value)
+        except ValidationError as error:
+            raise OptionError(f"option '{where}{key}' is {value!r}: {error.errors()[0]['msg']}") from error
+    try:
+        return replace(options, **values)
+    except SGAMError as error:
+        raise OptionError(f"{where}{error}") from error
+
+
+def as_json(options: MatchOptions) -> dict[str, Any]:
+    """The resolved options, as written to options.json and read by --config."""
+    content: dict[str, Any] = to_jsonable_python(options)
+    return content
+
+
+def fingerprint(options: MatchOptions, **inputs: Any) -> str:
+    """A digest of the options that the results of pairs follow from, and of the inputs."""
+    relevant = {name: value for name, value in as_json(options).items() if name not in NOT_IN_RESULTS}
+    text = json.dumps({"options": relevant, "inputs": to_jsonable_python(inputs)}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,39 @@
+"""Names of area matchers, point matchers and segmenters become objects, through entry points."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from sgam_core.errors import OptionError
+
+KINDS = {
+    "matcher": "sgam_sfm.matchers",
+    "segmenter": "sgam_sfm.segmenters",
+    "area-matcher": "sgam_sfm.area_matchers",
+}
+"""The option that names a model, and the entry-point group it is looked up in."""
+
+
+def available(kind: str) -> dict[str, EntryPoint]:
+    """Every installed entry point of a kind, by name, sorted."""
+    return {entry.name: entry for entry in sorted(entry_points(group=KINDS[kind]), key=lambda entry: entry.name)}
+
+
+def create(kind: str, name: str, **settings: Any) -> Any:
+    """Make the model of that name.
+
+    Of `settings` those are passed on that the model's constructor takes, so that a matcher of a few lines needs no
+    constructor at all.
+    Raises: OptionError for an unknown name, with the nearest one.
+    """
+    known = available(kind)
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise OptionError(f"--{kind} '{name}' is unknown; {hint}known: {', '.join(known)}")
+    factory = known[name].load()
+    taken = inspect.signature(factory).parameters
+    return factory(**{key: value for key, value in settings.items() if key in taken})

@@ -1,0 +1,27 @@
+"""Shared by all tests."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import jaxtyping
+import pytest
+
+DATA = Path(os.environ.get("SGAM_SFM_DATA", Path(__file__).parents[1] / "../shared/data"))
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The folder of real images, or a skip that says where it was looked for."""
+    if not DATA.is_dir():
+        pytest.skip(f"real images not found at '{DATA}'; set SGAM_SFM_DATA")
+    return DATA
+
+
+@pytest.fixture
+def unchecked():
+    """Turns the type checks of tests off, for tests of our own messages about wrong shapes."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sgam_core.crops import area_crop, whole_crop
+from sgam_core.errors import ShapeError
+from sgam_core.options import CropOptions
+from sgam_core.types import Box, Image
+
+
+def image(width: int, height: int, **more) -> Image:
+    y, x = np.mgrid[:height, :width]
+    return Image(name="a.jpg", pixels=np.stack([x % 256, y % 256, (x + y) % 256], axis=2).astype(np.uint8), **more)
+
+
+@given(
+    st.integers(1, 900),
+    st.integers(1, 900),
+    st.floats(0, 1),
+    st.floats(0, 1),
+    st.floats(0.01, 1),
+    st.floats(0.01, 1),
+    st.integers(1, 700),
+    st.booleans(),
+)
+def test_crop_then_uncrop_is_the_identity(width, height, x, y, w, h, area_size, upsample):
+    box = Box(x0=x * width, y0=y * height, x1=(x + w) * width, y1=(y + h) * height)
+    crop = area_crop(
+        Image(name="a", pixels=np.zeros((height, width, 3), np.uint8)),
+        box,
+        CropOptions(area_size=area_size, upsample=upsample),
+    )
+    assert 0 <= crop.window.x0 < crop.window.x1 <= width
+    assert 0 <= crop.window.y0 < crop.window.y1 <= height
+    assert max(crop.size) <= max(area_size, 1)
+    points = np.random.default_rng(0).uniform(0, 1, (20, 2)) * [width, height]
+    affine = crop.crop_from_image
+    there = points @ affine[:, :2].T + affine[:, 2]
+    np.testing.assert_allclose(crop.to_image(there), points, atol=1e-6)
+    corners = np.array([[crop.window.x0, crop.window.y0], [crop.window.x1, crop.window.y1]])
+    np.testing.assert_allclose(corners @ affine[:, :2].T + affine[:, 2], [[0, 0], list(crop.size)], atol=1e-6)
+    if not upsample:
+        assert crop.scale <= 1.0
+
+
+def test_a_crop_is_a_square_about_its_area_at_the_images_own_resolution():
+    crop = area_crop(image(1000, 800), Box(x0=400, y0=300, x1=600, y1=400), CropOptions(area_size=640))
+    assert crop.window == Box(x0=380, y0=230, x1=620, y1=470)  # 1.2 x 200 = 240
+    assert crop.size == (240, 240)
+    np.testing.assert_array_equal(crop.pixels(), image(1000, 800).pixels[230:470, 380:620])
+
+
+def test_a_crop_is_shifted_inside_and_cut_where_it_does_not_fit():
+    crop = area_crop(image(1000, 300), Box(x0=0, y0=0, x1=500, y1=280), CropOptions(area_size=300))
+    assert crop.window == Box(x0=0, y0=0, x1=600, y1=300)
+    assert crop.size == (300, 150)
+    assert crop.scale == 0.5
+
+
+def test_resizing_moves_pixel_centres_by_the_half_pixel_rule():
+    # Shrinking by two: the centre of crop pixel (0, 0) lies between the first four image pixels.
+    crop = whole_crop(image(200, 100), CropOptions(image_size=100))
+    np.testing.assert_allclose(crop.to_image(np.array([[0.5, 0.5]])), [[1.0, 1.0]])
+    np.testing.assert_allclose(crop.pixels()[0, :3, 0], [0, 2, 4], atol=1)
+
+
+def test_masks_are_cut_with_the_pixels_and_never_interpolated():
+    mask = np.zeros((100, 200), bool)
+    mask[:, 100:] = True
+    crop = whole_crop(image(200, 100, mask=mask), CropOptions(image_size=50))
+    found = crop.mask()
+    assert found is not None
+    assert found.shape == (25, 50)
+    np.testing.assert_array_equal(found[0], np.arange(50) >= 25)
+
+
+def test_a_mask_of_another_size_is_named(unchecked):
+    with pytest.raises(ShapeError, match=r"mask of 'a.jpg' is 10x10 but the image is 100x200 \(height x width\)"):
+        image(200, 100, mask=np.ones((10, 10), bool))
+
+
+def test_an_image_that_is_not_rgb_is_named(unchecked):
+    with pytest.raises(ShapeError, match=r"image 'g' is uint8 \(4, 4, 1\); expected uint8 \(height, width, 3\) RGB"):
+        Image(name="g", pixels=np.zeros((4, 4, 1), np.uint8))
+
+
+def test_an_empty_box_is_refused():
+    with pytest.raises(ShapeError, match="is empty; expected x0 < x1"):
+        Box(x0=3, y0=0, x1=3, y1=2)
