@@ -36,14 +36,14 @@ class LabelCounts:
     def of(labels: Int32[np.ndarray, "H W"]) -> LabelCounts:
         """Count the labels (H, W) per cell and sum up."""
         height, width = labels.shape
-        ids, index = np.unique(labels, return_inverse=True)
+        ids, index = _compact(labels)
         rows, columns = -(-height // CELL_PX), -(-width // CELL_PX)
         cell = (np.arange(height) // CELL_PX)[:, None] * columns + np.arange(width) // CELL_PX
-        flat = (cell * len(ids) + index.reshape(labels.shape)).ravel()
+        flat = (cell * len(ids) + index).ravel()
         counts = np.bincount(flat, minlength=rows * columns * len(ids)).reshape(rows, columns, len(ids))
         integral = np.zeros((rows + 1, columns + 1, len(ids)), np.int32)
         integral[1:, 1:] = counts.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
-        return LabelCounts(ids=ids.astype(np.int64), integral=integral, width=width, height=height)
+        return LabelCounts(ids=ids, integral=integral, width=width, height=height)
 
     def proportions(
         self,
@@ -59,6 +59,14 @@ class LabelCounts:
         table = self.integral
         counts = table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0]
         return counts / np.maximum(counts.sum(1, keepdims=True), 1)
+
+
+def _compact(labels: Int32[np.ndarray, "H W"]) -> tuple[Int64[np.ndarray, " C"], Int64[np.ndarray, "H W"]]:
+    """The labels that occur (C,), sorted, and each pixel's position among them (H, W)."""
+    ids = np.flatnonzero(np.bincount(labels.ravel()))
+    position = np.zeros(int(ids[-1]) + 1, np.int64)
+    position[ids] = np.arange(len(ids))
+    return ids, position[labels]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

@@ -38,7 +38,7 @@ def detect_object_areas(
     height, width = labels.shape
     notes: list[str] = []
     found: list[tuple[int, Box]] = []
-    for label in np.unique(labels).tolist():
+    for label in np.flatnonzero(np.bincount(labels.ravel())).tolist():
         if label == 0 or label in ignored:
             continue
         boxes = [box for box in _fuse(_components(labels == label, options), options.fuse_px) if _fits(box, options)]
@@ -66,12 +66,19 @@ def _components(mask: Shaped[np.ndarray, "H W"], options: ObjectAreaOptions) -> 
     min_pixels = options.min_share * mask.size
     if np.count_nonzero(mask) < min_pixels:
         return []
-    cleaned: np.ndarray = mask.astype(np.uint8)
+    x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
+    bottom, right = y + height + options.close_px, x + width + options.close_px  # closing reaches no farther
+    y, x = max(y - options.close_px, 0), max(x - options.close_px, 0)
+    cleaned: np.ndarray = mask[y:bottom, x:right].astype(np.uint8)
     for operation, size in ((cv2.MORPH_CLOSE, options.close_px), (cv2.MORPH_OPEN, options.open_px)):
         if size > 1:
             cleaned = cv2.morphologyEx(cleaned, operation, np.ones((size, size), np.uint8))
     stats = cv2.connectedComponentsWithStats(cleaned, connectivity=8)[2][1:].tolist()
-    return [Box(x0=x, y0=y, x1=x + w, y1=y + h) for x, y, w, h, pixels in stats if pixels >= min_pixels]
+    return [
+        Box(x0=x + left, y0=y + top, x1=x + left + w, y1=y + top + h)
+        for left, top, w, h, pixels in stats
+        if pixels >= min_pixels
+    ]
 
 
 def _fuse(boxes: Sequence[Box], fuse_px: float) -> list[Box]:

@@ -50,6 +50,8 @@ class SemanticAreaMatcher:
         if labels is None or labels.ndim != 2 or labels.size == 0:
             came = "none" if labels is None else f"of shape {labels.shape}"
             raise ShapeError(f"labels of '{image.name}' are {came}; expected a (height, width) integer label map")
+        if int(labels.min()) < 0:
+            raise ShapeError(f"labels of '{image.name}' go down to {int(labels.min())}; expected ids from 0 (void) up")
         options = self.options
         sized = _sized(labels)
         if image.mask is not None:
@@ -64,7 +66,7 @@ class SemanticAreaMatcher:
         window_px, _ = window_sizes(counts, counts, 1.0, options.intersections)
         enabled = options.intersections.enabled
         return SemanticDescription(
-            labels=frozenset(np.unique(sized).tolist()) - {0},
+            labels=frozenset(np.flatnonzero(np.bincount(sized.ravel())).tolist()) - {0},
             objects=objects,
             counts=counts,
             windows=detect_intersection_areas(counts, window_px, options.intersections) if enabled else (),

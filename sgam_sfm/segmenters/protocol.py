@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int32
@@ -11,6 +11,7 @@ from jaxtyping import Int32
 from sgam_sfm.images import ImageFile
 
 
+@runtime_checkable
 class Segmenter(Protocol):
     """Gives every image of a collection a label map; equal labels mean the same thing in all of them."""
 
