@@ -3,7 +3,7 @@
 from sgam_core.a2pm import WholeImages, match_described, match_pair
 from sgam_core.options import PRESETS, SGAMOptions
 from sgam_core.protocols import AreaMatcher, PointMatcher
-from sgam_core.semantic import SemanticAreaMatcher
+from sgam_core.semantic import SemanticAreaMatcher, layout_labels
 from sgam_core.types import (
     Area,
     AreaMatch,
@@ -34,6 +34,7 @@ __all__ = [
     "SemanticAreaMatcher",
     "TwoViewModel",
     "WholeImages",
+    "layout_labels",
     "match_described",
     "match_pair",
 ]

@@ -37,7 +37,7 @@ def reject(
     """
     candidates = [area for area in areas if area.area.state is AreaState.KEPT]
     if not candidates:
-        return Verdict(areas=tuple(areas), model=None, fallback="no area match" if not areas else "no area match left")
+        return Verdict(areas=tuple(areas), model=None, fallback="no area match" if not areas else "no area match left after GP")
     if options.rule == "consensus":
         single = len(candidates) == 1
         whole = match_whole() if whole_is_known or single else Matches.empty()
@@ -49,7 +49,7 @@ def reject(
     judged_all = [verdicts.get(id(area), area) for area in areas]
     kept = [area for area in judged_all if area.area.state is AreaState.KEPT]
     if not kept and not fallback:
-        fallback = f"GR rejected all {len(candidates)} area matches"
+        fallback = f"GR rejected all: {len(candidates)} area matches"
     if not fallback:
         model = estimate(_pool(kept, options.max_pooled)) or model
     counted = tuple(_counted(area, model, geometry) for area in judged_all)
@@ -75,11 +75,11 @@ def _consensus(
     else:
         model = estimate(Matches.concatenate([pool, _best(whole, len(pool))]))
     if model is None:
-        return list(candidates), None, "no two-view geometry from the areas' matches"
+        return list(candidates), None, "no geometry: the areas' matches give none"
     ratio = float((residuals(model.F, pool) <= geometry.max_residual).mean()) if len(pool) else 0.0
     if ratio < options.min_pool_inlier_ratio and not single:
-        low = f"{ratio:.2f} of the areas' matches agree on one geometry, below {options.min_pool_inlier_ratio:.2f}"
-        return list(candidates), model, low
+        agree = f"{ratio:.2f} of their matches fit one geometry, below {options.min_pool_inlier_ratio:.2f}"
+        return list(candidates), model, f"areas disagree: {agree}"
     return [_judge(candidate, model, geometry, options) for candidate in candidates], model, ""
 
 

@@ -53,7 +53,7 @@ class SemanticAreaMatcher:
         if int(labels.min()) < 0:
             raise ShapeError(f"labels of '{image.name}' go down to {int(labels.min())}; expected ids from 0 (void) up")
         options = self.options
-        sized = _sized(labels)
+        sized = layout_labels(labels)
         if image.mask is not None:
             size = (sized.shape[1], sized.shape[0])
             wanted = cv2.resize(image.mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT)
@@ -110,8 +110,8 @@ class SemanticAreaMatcher:
         )
 
 
-def _sized(labels: Int32[np.ndarray, "H W"]) -> Int32[np.ndarray, "h w"]:
-    """Labels at LABEL_WIDTH, never interpolated."""
+def layout_labels(labels: Int32[np.ndarray, "H W"]) -> Int32[np.ndarray, "h w"]:
+    """A label map at LABEL_WIDTH, as `describe` brings it to; never interpolated."""
     height = max(round(labels.shape[0] * LABEL_WIDTH / labels.shape[1]), 1)
     if labels.shape == (height, LABEL_WIDTH):
         return labels

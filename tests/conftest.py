@@ -15,6 +15,8 @@ DATA = Path(os.environ.get("SGAM_SFM_DATA", Path(__file__).parents[1] / "../shar
 def data() -> Path:
     """The folder of real images, or a skip that says where it was looked for."""
     if not DATA.is_dir():
+        if os.environ.get("SGAM_SFM_REQUIRE_DATA"):
+            pytest.fail(f"real images not found at '{DATA}', and SGAM_SFM_REQUIRE_DATA is set")
         pytest.skip(f"real images not found at '{DATA}'; set SGAM_SFM_DATA")
     return DATA
 

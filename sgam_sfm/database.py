@@ -1,0 +1,445 @@
+"""COLMAP's database: import images and cameras, write keypoints and matches, read everything back.
+
+Pixels have COLMAP's corner origin, as everywhere in this project: nothing is shifted here.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import sqlite3
+import zlib  # noqa: F401  (before pycolmap, whose wheel carries a zlib of its own: loaded later, ours would mix the two)
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float
+
+from sgam_core.errors import InputError, OptionError, ShapeError, StageError
+from sgam_sfm.files import replacing
+from sgam_sfm.pairs import Pair
+
+logger = logging.getLogger(__name__)
+
+CAMERA_MODELS = tuple(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
+CAMERA_MODES = ("auto", "single", "per-folder", "per-image")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CameraOptions:
+    """How images get their cameras; the defaults are COLMAP's own.
+
+    model: a COLMAP camera model. params: its parameters for all images ("f,cx,cy,k" or numbers), None for the EXIF
+    focal length or COLMAP's guess of 1.2 * max(width, height). mode: which images share a camera: auto (COLMAP's
+    choice), single, per-folder, per-image. cameras: a file or COLMAP model with known cameras, see `read_cameras`; the
+    images it does not name follow the other options.
+    """
+
+    model: str = "SIMPLE_RADIAL"
+    params: str | tuple[float, ...] | None = None
+    mode: str = "auto"
+    cameras: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.mode not in CAMERA_MODES:
+            raise OptionError(f"camera mode '{self.mode}' is unknown; choose one of {', '.join(CAMERA_MODES)}")
+        try:
+            object.__setattr__(self, "params", _parameters(self.model, self.params))
+        except ValueError as error:
+            raise OptionError(str(error)) from error
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class KnownCamera:
+    """A camera that the user gave."""
+
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CameraInfo:
+    """An image of the database and its camera.
+
+    has_prior_focal: the focal length is known, from the user or from EXIF. known: the user gave all parameters.
+    """
+
+    image_id: int
+    camera_id: int
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+    has_prior_focal: bool
+    known: bool
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ImportedImages:
+    """What COLMAP made of the images. cameras: by image name. failures: why an image could not be imported."""
+
+    cameras: Mapping[str, CameraInfo]
+    failures: Mapping[str, str]
+
+    @property
+    def known_camera_ids(self) -> tuple[int, ...]:
+        """Cameras that the user gave, which mapping holds fixed unless asked otherwise."""
+        return tuple(sorted({info.camera_id for info in self.cameras.values() if info.known}))
+
+
+def import_cameras(
+    database_path: Path, image_folder: Path, names: Sequence[str], options: CameraOptions | None = None
+) -> ImportedImages:
+    """Make a new database with the images, their cameras, rigs and frames, and GPS positions from EXIF.
+
+    An existing database is replaced. Image ids do not depend on the order of `names`.
+
+    Raises: InputError when a known camera does not have the size of its image, or the cameras cannot be read.
+    """
+    options = options or CameraOptions()
+    known = read_cameras(options.cameras, names) if options.cameras else {}
+    with _replacing(database_path) as partial:
+        pycolmap.Database.open(partial).close()
+        for group, mode, model, params in _import_groups(names, known, options):
+            reader = pycolmap.ImageReaderOptions()
+            reader.camera_model, reader.camera_params = model, ",".join(map(repr, params or ()))
+            with _quiet():  # what COLMAP would print about unreadable images is returned as failures
+                pycolmap.import_images(partial, image_folder, mode, group, reader)
+        cameras = _read_cameras_of_images(partial, {*known} if options.params is None else {*names})
+        failures, sizes = _failures(image_folder, sorted({*names} - {*cameras}))
+        sizes |= {name: (info.width, info.height) for name, info in cameras.items()}
+        for name, given in known.items():
+            if name in sizes and sizes[name] != (given.width, given.height):
+                raise InputError(
+                    f"the camera of '{name}' in {options.cameras} is {given.width}x{given.height} but the image is "
+                    f"{sizes[name][0]}x{sizes[name][1]} (width x height); give the camera of the image as it is"
+                )
+    return ImportedImages(cameras=cameras, failures=failures)
+
+
+def camera_matrix(info: CameraInfo) -> Float[np.ndarray, "3 3"] | None:
+    """Pinhole matrix (3, 3), corner origin, for the two-view geometry of matching; lens distortion is ignored.
+
+    Returns: None when the focal length is not known, or the lens (fisheye, panorama) is no pinhole even roughly.
+    """
+    camera = pycolmap.Camera(model=info.model, width=info.width, height=info.height, params=info.params)
+    if not info.has_prior_focal or not camera.is_perspective_pinhole():
+        return None
+    return np.asarray(camera.calibration_matrix(), np.float64)
+
+
+def read_cameras(path: Path, names: Sequence[str]) -> dict[str, KnownCamera]:
+    """Read known cameras: a text file, or a folder with a COLMAP model (text or binary) whose images have our names.
+
+    A line of the text file is `name MODEL width height params...`, hloc's list of images with intrinsics: the image's
+    name, or `*` for every image that has no line of its own; a tab after a name that contains spaces; `#` comments and
+    blank lines are skipped. Images with equal cameras share one.
+
+    Args: names: the images of the collection; cameras of other images are left out, with a warning.
+    Raises: InputError when the file or a line cannot be used, or no camera belongs to any of the images.
+    """
+    cameras = _model_cameras(path) if path.is_dir() else _listed_cameras(path)
+    everyone = cameras.pop("*", None)
+    others = sorted(set(cameras) - set(names))
+    if others:
+        logger.warning("%s names %d images that are not in the collection, such as '%s'", path, len(others), others[0])
+    chosen = {name: camera for name in names if (camera := cameras.get(name, everyone)) is not None}
+    if not chosen:
+        raise InputError(
+            f"{path} has no camera for any of the {len(names)} images; its names are relative to the image folder"
+        )
+    return chosen
+
+
+def write_database(
+    path: Path, imported: Path, keypoints: Mapping[str, np.ndarray], matches: Mapping[Pair, np.ndarray]
+) -> None:
+    """Write a database that is ready to be verified and mapped; it appears at `path` only when it is complete.
+
+    Args: imported: database of `import_cameras`, whose images and cameras are copied (it may be `path` itself).
+        keypoints: (N, 2) pixels by image name, corner origin; an image left out gets none. matches: (M, 2) indices of
+        keypoints by pair, one-to-one.
+    Raises: ShapeError when an array has another shape, an index is out of range or used twice; InputError when a name
+        is not in the database.
+    """
+    with _replacing(path) as partial:
+        _copy(imported, partial)
+        with pycolmap.Database.open(partial) as database:
+            database.clear_two_view_geometries()
+            database.clear_matches()
+            database.clear_descriptors()
+            database.clear_keypoints()
+            ids = {image.name: image.image_id for image in database.read_all_images()}
+            unknown = ({*keypoints} | {name for pair in matches for name in pair}) - {*ids}
+            if unknown:
+                raise InputError(f"image '{min(unknown)}' is not in {imported}; import its camera first")
+            for name, image_id in sorted(ids.items(), key=lambda item: item[1]):
+                points = keypoints.get(name, np.zeros((0, 2), np.float32))
+                _check_keypoints(name, points)
+                database.write_keypoints(image_id, np.ascontiguousarray(points, np.float32))
+            for pair, indices in sorted(matches.items(), key=lambda item: sorted(ids[name] for name in item[0])):
+                _check_matches(pair, indices, (len(keypoints.get(pair[0], ())), len(keypoints.get(pair[1], ()))))
+                if database.exists_matches(ids[pair[0]], ids[pair[1]]):
+                    raise InputError(f"the pair {pair} has matches in both directions; give them in one")
+                database.write_matches(ids[pair[0]], ids[pair[1]], np.ascontiguousarray(indices, np.uint32))
+
+
+def read_database(path: Path) -> dict[str, dict]:
+    """Everything in a database as plain values and arrays.
+
+    Returns: `cameras` by id; `images` by name; `keypoints` (N, 2) float32 by name; `matches` (M, 2) uint32 and
+        `two_view_geometries` (config, F, E, H, inlier_matches) by pair, the image with the smaller id first.
+    Raises: InputError when the file is missing or no COLMAP database.
+    """
+    with _opened(path) as database:
+        images = {image.image_id: image for image in database.read_all_images()}
+
+        def pair(pair_id: int) -> Pair:
+            id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
+            return images[id0].name, images[id1].name
+
+        return {
+            "cameras": {
+                camera.camera_id: {
+                    "model": camera.model_name,
+                    "width": camera.width,
+                    "height": camera.height,
+                    "params": np.asarray(camera.params),
+                    "has_prior_focal": camera.has_prior_focal_length,
+                }
+                for camera in database.read_all_cameras()
+            },
+            "images": {
+                image.name: {"image_id": image.image_id, "camera_id": image.camera_id} for image in images.values()
+            },
+            "keypoints": {image.name: database.read_keypoints(image.image_id) for image in images.values()},
+            "matches": {pair(pair_id): indices for pair_id, indices in zip(*database.read_all_matches(), strict=True)},
+            "two_view_geometries": {
+                pair(pair_id): {
+                    "config": pycolmap.TwoViewGeometryConfiguration(geometry.config).name,
+                    **{matrix: getattr(geometry, matrix) for matrix in ("F", "E", "H", "inlier_matches")},
+                }
+                for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True)
+            },
+        }
+
+
+def database_content(path: Path) -> dict[str, dict]:
+    """`read_database` with lists in place of arrays: two databases are equal when this is."""
+    return _plain(read_database(path))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return {key: _plain(item) for key, item in value.items()} if isinstance(value, dict) else value
+
+
+def _parameters(model: str, params: str | Sequence[float | str] | None) -> tuple[float, ...] | None:
+    """The parameters as numbers. Raises: ValueError, with a message for users, when they do not fit the model."""
+    if model not in CAMERA_MODELS:
+        raise ValueError(f"camera model '{model}' is unknown; choose one of {', '.join(CAMERA_MODELS)}")
+    if params is None:
+        return None
+    texts = [text for text in params.split(",") if text.strip()] if isinstance(params, str) else list(params)
+    expected = pycolmap.Camera.create_from_model_name(1, model, 1.0, 2, 2)
+    given = ",".join(map(str, texts))
+    if len(texts) != len(expected.params):
+        raise ValueError(
+            f"camera model {model} has {len(expected.params)} parameters ({expected.params_info}) but {len(texts)} "
+            f"were given: '{given}'"
+        )
+    try:
+        values = tuple(map(float, texts))
+    except ValueError:
+        values = (math.nan,)
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f"camera parameters '{given}' of {model} ({expected.params_info}) are not all numbers")
+    return values
+
+
+def _model_cameras(folder: Path) -> dict[str, KnownCamera]:
+    try:
+        with _quiet():
+            model = pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(
+            f"{folder} cannot be read as a COLMAP model ({str(error).splitlines()[0]}); it needs cameras, images and "
+            "points3D as .txt or .bin"
+        ) from error
+    cameras = {
+        camera_id: KnownCamera(
+            model=camera.model_name,
+            params=tuple(map(float, camera.params)),
+            width=camera.width,
+            height=camera.height,
+        )
+        for camera_id, camera in model.cameras.items()
+    }
+    return {image.name: cameras[image.camera_id] for image in model.images.values()}
+
+
+def _listed_cameras(path: Path) -> dict[str, KnownCamera]:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
+    except OSError as error:
+        raise InputError(f"cannot read the cameras in {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"the cameras in {path} are neither UTF-8 text nor a folder with a COLMAP model") from error
+    cameras: dict[str, KnownCamera] = {}
+    for number, line in enumerate(map(str.strip, lines), start=1):
+        if not line or line.startswith("#"):
+            continue
+        name, _, rest = line.partition("\t") if "\t" in line else line.partition(" ")
+        fields = rest.split()
+        try:
+            if len(fields) < 3 or not (fields[1].isdecimal() and fields[2].isdecimal()):
+                raise ValueError("expected 'name MODEL width height params...', a tab after a name with spaces")
+            if name in cameras:
+                raise ValueError(f"'{name}' has a camera already")
+            params = _parameters(fields[0], tuple(fields[3:]))
+        except ValueError as error:
+            raise InputError(f"{path}, line {number}: {error}") from error
+        cameras[name] = KnownCamera(model=fields[0], params=params or (), width=int(fields[1]), height=int(fields[2]))
+    return cameras
+
+
+def _import_groups(
+    names: Sequence[str], known: Mapping[str, KnownCamera], options: CameraOptions
+) -> Iterator[tuple[list[str], pycolmap.CameraMode, str, Sequence[float] | None]]:
+    """Images that are imported together: names, camera mode, model and parameters."""
+    single = pycolmap.CameraMode.SINGLE
+    by_camera: dict[KnownCamera, list[str]] = {}
+    by_folder: dict[str, list[str]] = {}
+    for name in sorted(names):
+        if name in known:
+            by_camera.setdefault(known[name], []).append(name)
+        else:
+            # COLMAP's own per-folder mode gives images that sort after a subfolder that subfolder's camera.
+            folder = str(PurePosixPath(name).parent) if options.mode == "per-folder" else ""
+            by_folder.setdefault(folder, []).append(name)
+    mode = {
+        "auto": pycolmap.CameraMode.AUTO,
+        "single": single,
+        "per-folder": single,
+        "per-image": pycolmap.CameraMode.PER_IMAGE,
+    }[options.mode]
+    for group in by_folder.values():
+        yield group, mode, options.model, options.params  # type: ignore[misc]
+    for camera, group in by_camera.items():
+        yield group, single, camera.model, camera.params
+
+
+def _read_cameras_of_images(path: Path, known: Collection[str]) -> dict[str, CameraInfo]:
+    with pycolmap.Database.open(path) as database:
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        images = sorted(database.read_all_images(), key=lambda image: image.name)
+    return {
+        image.name: CameraInfo(
+            image_id=image.image_id,
+            camera_id=image.camera_id,
+            model=cameras[image.camera_id].model_name,
+            params=tuple(map(float, cameras[image.camera_id].params)),
+            width=cameras[image.camera_id].width,
+            height=cameras[image.camera_id].height,
+            has_prior_focal=cameras[image.camera_id].has_prior_focal_length,
+            known=image.name in known,
+        )
+        for image in images
+    }
+
+
+def _failures(image_folder: Path, names: Sequence[str]) -> tuple[dict[str, str], dict[str, tuple[int, int]]]:
+    """Why COLMAP left out these images, and the sizes (width, height) of those it can read."""
+    reasons, sizes = {}, {}
+    for name in names:
+        bitmap = pycolmap.Bitmap.read(image_folder / name, True)
+        if bitmap is None:
+            reasons[name] = "COLMAP cannot read this file; save the image as JPEG or PNG"
+        else:
+            sizes[name] = (bitmap.width, bitmap.height)
+            reasons[name] = (
+                f"it is {bitmap.width}x{bitmap.height} (width x height), another size than the images it would share "
+                "a camera with; use --camera-mode auto or per-image"
+            )
+    return reasons, sizes
+
+
+def _check_keypoints(name: str, points: np.ndarray) -> None:
+    # COLMAP accepts more columns than it documents and ends the process when it verifies them.
+    if points.ndim != 2 or points.shape[1] != 2 or points.dtype.kind != "f":
+        raise ShapeError(f"keypoints of '{name}' are {points.dtype} {points.shape}; expected float32 (N, 2)")
+    if not np.isfinite(points).all():
+        raise ShapeError(f"keypoints of '{name}' contain values that are not finite")
+
+
+def _check_matches(pair: Pair, indices: np.ndarray, counts: tuple[int, int]) -> None:
+    # COLMAP checks none of this: out-of-range indices read foreign memory, repeated ones bend the geometry.
+    if indices.ndim != 2 or indices.shape[1] != 2 or indices.dtype.kind not in "iu":
+        raise ShapeError(f"matches of {pair} are {indices.dtype} {indices.shape}; expected uint32 (M, 2)")
+    for side in (0, 1):
+        column = indices[:, side]
+        if len(column) and (column.min() < 0 or column.max() >= counts[side]):
+            raise ShapeError(
+                f"matches of {pair} name keypoint {column.max() if column.min() >= 0 else column.min()} of "
+                f"'{pair[side]}', which has {counts[side]}"
+            )
+        if len(np.unique(column)) != len(column):
+            raise ShapeError(f"matches of {pair} use a keypoint of '{pair[side]}' more than once; expected one-to-one")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[pycolmap.Database]:
+    # COLMAP would create a missing file.
+    if not path.is_file():
+        raise InputError(f"there is no database at {path}")
+    try:
+        database = pycolmap.Database.open(path)
+    except RuntimeError as error:
+        raise InputError(f"{path} is not a COLMAP database") from error
+    with database:
+        yield database
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy an SQLite file with what is still in its journal."""
+    if not source.is_file():
+        raise InputError(f"there is no database at {source}")
+    try:
+        with closing(sqlite3.connect(source)) as old, closing(sqlite3.connect(target)) as new:
+            old.backup(new)
+    except sqlite3.Error as error:
+        raise StageError(f"cannot copy the database {source}: {error}") from error
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """A database beside `path` that takes its place, without the journals of either, when all went well."""
+    with replacing(path) as partial:
+        try:
+            yield partial
+            _remove_journals(path)  # the old one's would be applied to the new one
+        finally:
+            _remove_journals(partial)
+
+
+def _remove_journals(path: Path) -> None:
+    for suffix in ("-wal", "-shm", "-journal"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep COLMAP from printing anything short of a fatal error."""
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level

@@ -1,0 +1,243 @@
+"""XFeat*: semi-dense matching of learned features at two scales, on kornia's model (Potje et al., CVPR 2024).
+
+Follows the paper's semi-dense mode with four differences, each measured:
+- every crop is resized once per scale (not twice), so that a cell of the network is an exact affine map of crop pixels;
+- descriptors are normalised before they are compared;
+- the offset inside a cell is calibrated and applied to both sides. The network predicts where the reference point of
+  the other image's cell lies in this image's cell, and its softmax expectation falls short of the true offset by a
+  sixth. Asked both ways it gives two correspondences of one cell pair; their midpoint is again a correspondence of a
+  locally affine map, with less noise, no bias, and no preference for one of the images;
+- fewer of the features come from the coarse scale, whose cells cover 13 pixels.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from kornia.feature.xfeat import XFeatModel
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, normalize
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from sgam_core.errors import OptionError, WeightsError
+from sgam_core.types import Crop, Matches
+from sgam_sfm.weights import XFEAT, find_weights
+
+CELL = 8  # pixels of the network's input per cell
+MULTIPLE = 32  # the input's width and height are multiples of this
+SOFTMAX_TEMPERATURE = 3.0  # of the 8 x 8 offset logits, as published
+OFFSET_GAIN = 1.2  # true offset over expected offset: regressed on warps with exact ground truth
+MIN_FEATURES = 64  # of a crop, however small
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Features:
+    """The features of one crop: raw descriptors (K, 64), centres of their cells and the size of a network pixel
+    (K, 2), both in crop pixels."""
+
+    descriptors: Tensor
+    centers: Tensor
+    steps: Tensor
+
+    @property
+    def nbytes(self) -> int:
+        return sum(t.nbytes for t in (self.descriptors, self.centers, self.steps))
+
+    def select(self, rows: Tensor) -> _Features:
+        return _Features(self.descriptors[rows], self.centers[rows], self.steps[rows])
+
+
+class XFeatStar:
+    """Point matcher (`sgam_core.protocols.PointMatcher`): XFeat, semi-dense.
+
+    Features of a crop are extracted once and kept, least recently used dropped first, until `reset()`. Crops go
+    through the network one by one, so that no result depends on what else was asked for or is cached. Equal input
+    gives equal output; `seed` is accepted as by every matcher, but nothing here is random.
+
+    The score of a match is cos^4 * sqrt(c0 * c1): the cosine of its descriptors, and the confidences of the two
+    offsets. It ranks inliers better than any of the three alone.
+
+    Args:
+        weights: the model file; found by itself when omitted.
+        device: a torch device, such as `cpu` or `cuda:0`. On CUDA the network runs in half precision.
+        features_per_megapixel: how many cells of a crop are kept, by reliability.
+        scales: the two sizes at which a crop is seen, as factors of its own.
+        coarse_share: share of the features that comes from the first scale; 0 for the second scale alone.
+        min_confidence: both offset confidences of a match exceed it; 0 disables.
+        min_cosine: the descriptors' cosine exceeds it; -1 disables.
+        cache_bytes: bound of the kept features.
+
+    Attributes:
+        pixels_extracted: crop pixels that went through the network so far, for cost reports.
+    """
+
+    def __init__(
+        self,
+        *,
+        weights: Path | None = None,
+        device: str = "cpu",
+        seed: int = 0,
+        features_per_megapixel: int = 12_000,
+        scales: tuple[float, float] = (0.6, 1.3),
+        coarse_share: float = 0.1,
+        min_confidence: float = 0.25,
+        min_cosine: float = 0.8,
+        cache_bytes: int = 512 * 2**20,
+    ) -> None:
+        if not 0 <= coarse_share < 1:
+            raise OptionError(f"coarse_share is {coarse_share}; expected at least 0 and less than 1")
+        if features_per_megapixel < 1:
+            raise OptionError(f"features_per_megapixel is {features_per_megapixel}; expected at least 1")
+        if min(scales) <= 0:
+            raise OptionError(f"scales are {scales}; expected two positive factors")
+        self.device = _device(device)
+        self.features_per_megapixel = features_per_megapixel
+        self.shares = ((scales[0], coarse_share), (scales[1], 1 - coarse_share))
+        self.min_confidence = min_confidence
+        self.min_cosine = min_cosine
+        self.cache_bytes = cache_bytes
+        self.pixels_extracted = 0
+        self._cache: OrderedDict[tuple, _Features] = OrderedDict()
+        self._net = _load(find_weights(XFEAT, weights)).to(self.device)
+
+    def reset(self) -> None:
+        """Forget all features."""
+        self._cache.clear()
+
+    @torch.inference_mode()
+    def match(self, pairs: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
+        """Match every pair of crops; see `PointMatcher.match`."""
+        return [self._match(crop0, crop1) for crop0, crop1 in pairs]
+
+    def _match(self, crop0: Crop, crop1: Crop) -> Matches:
+        features0, features1 = self._features(crop0), self._features(crop1)
+        rows0, rows1, cosines = _mutual_nearest(features0.descriptors, features1.descriptors, self.min_cosine)
+        side0, side1 = features0.select(rows0), features1.select(rows1)
+
+        offsets0, confidences0 = self._offsets(side0, side1)
+        sure = confidences0 > self.min_confidence  # the second pass is spent on those that can still pass
+        side0, side1 = side0.select(sure), side1.select(sure)
+        offsets1, confidences1 = self._offsets(side1, side0)
+        points0 = (side0.centers + offsets0[sure] / 2).cpu().numpy()
+        points1 = (side1.centers + offsets1 / 2).cpu().numpy()
+        scores = (cosines[sure] ** 4 * torch.sqrt(confidences0[sure] * confidences1)).clamp(0, 1).cpu().numpy()
+
+        good = (confidences1 > self.min_confidence).cpu().numpy() & _wanted(crop0, points0) & _wanted(crop1, points1)
+        return Matches(points0=points0[good], points1=points1[good], scores=scores[good])
+
+    def _features(self, crop: Crop) -> _Features:
+        if (features := self._cache.pop(crop.key, None)) is None:
+            features = self._extract(crop)
+        self._cache[crop.key] = features
+        while sum(f.nbytes for f in self._cache.values()) > self.cache_bytes and len(self._cache) > 1:
+            self._cache.popitem(last=False)
+        return features
+
+    def _extract(self, crop: Crop) -> _Features:
+        width, height = crop.size
+        self.pixels_extracted += width * height
+        gray = torch.from_numpy(crop.pixels()).to(self.device).float().mean(-1)
+        budget = max(MIN_FEATURES, round(self.features_per_megapixel * width * height / 1e6))
+        parts = [
+            self._extract_at(scale, round(share * budget), gray, crop) for scale, share in self.shares if share > 0
+        ]
+        return _Features(*(torch.cat([getattr(part, name) for part in parts]) for name in _Features.__slots__))
+
+    def _extract_at(self, scale: float, count: int, gray: Tensor, crop: Crop) -> _Features:
+        """The `count` most reliable cells of the crop, seen at `scale` of its size."""
+        width, height = (max(MULTIPLE, round(scale * side / MULTIPLE) * MULTIPLE) for side in crop.size)
+        image = interpolate(gray[None, None], (height, width), mode="bilinear", align_corners=False)
+        with torch.autocast(self.device.type, torch.float16, enabled=self.device.type == "cuda"):
+            maps, _, reliability = self._net(image.contiguous(memory_format=torch.channels_last))
+
+        cells_y, cells_x = torch.meshgrid(*(torch.arange(n, device=self.device) for n in maps.shape[2:]), indexing="ij")
+        step = torch.tensor([crop.size[0] / width, crop.size[1] / height], dtype=torch.float64, device=self.device)
+        centers = (CELL * torch.stack([cells_x, cells_y], -1).reshape(-1, 2) + CELL / 2) * step
+        best = reliability.float().flatten().argsort(descending=True, stable=True)
+        if crop.image.mask is not None:
+            best = best[torch.from_numpy(_wanted(crop, centers.cpu().numpy())).to(self.device)[best]]
+        best = best[:count]
+        descriptors = maps.float()[0].flatten(1).T[best].contiguous()
+        return _Features(descriptors, centers[best], step.expand(len(best), 2))
+
+    def _offsets(self, here: _Features, there: _Features) -> tuple[Tensor, Tensor]:
+        """Where the cell centres `there` lie `here`: (M, 2) crop pixels from the centre, and (M,) confidences."""
+        logits = self._net.fine_matcher(torch.cat([here.descriptors, there.descriptors], 1))
+        shares = (SOFTMAX_TEMPERATURE * logits).softmax(-1)
+        bins = torch.arange(CELL, device=self.device) - (CELL - 1) / 2
+        by_row = shares.view(-1, CELL, CELL)
+        expected = torch.stack([by_row.sum(1) @ bins, by_row.sum(2) @ bins], -1)
+        return OFFSET_GAIN * expected * here.steps, shares.amax(-1)
+
+
+def _load(path: Path) -> XFeatModel:
+    net = XFeatModel()
+    try:
+        net.load_state_dict(torch.load(path, map_location="cpu", weights_only=True), strict=True)
+    except Exception as error:  # torch raises a different type for every way in which a file can be wrong
+        raise WeightsError(f"'{path}' cannot be loaded as XFeat weights ({str(error).splitlines()[0]})") from error
+    net.eval().requires_grad_(False)
+    net.keypoint_head = nn.Sequential()  # serves the sparse mode only
+    for layers in [module for module in net.modules() if isinstance(module, nn.Sequential)]:
+        for i, norm in enumerate(layers):  # folding saves a pass over the largest maps
+            if isinstance(norm, nn.BatchNorm2d):
+                layers[i - 1], layers[i] = fuse_conv_bn_eval(layers[i - 1], norm), nn.Identity()  # type: ignore[type-var]
+    return nn.Module.to(net, memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+def _mutual_nearest(
+    descriptors0: Float[Tensor, "K0 C"], descriptors1: Float[Tensor, "K1 C"], min_cosine: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows of both sides that are each other's nearest by cosine, and the cosines (M,).
+
+    The similarity matrix is made in blocks of rows that stay in the processor's cache: memory is bounded, and the two
+    reductions cost little more than the product. A pair is mutual when the maximum of its row is that of its column.
+    """
+    if not (len(descriptors0) and len(descriptors1)):
+        none = torch.zeros(0, dtype=torch.int64, device=descriptors0.device)
+        return none, none, descriptors0.new_zeros(0)
+    unit0, unit1 = normalize(descriptors0, dim=1), normalize(descriptors1, dim=1)
+    block_elements = 2**20 if unit0.device.type == "cpu" else 2**26
+    column_best = unit1.new_full((len(unit1),), -torch.inf)
+    nearest, row_best = [], []
+    for block in torch.split(unit0, max(1, block_elements // len(unit1))):
+        cosines = block @ unit1.T
+        # numpy's argmax is several times as fast as torch's on the CPU
+        index = torch.from_numpy(cosines.numpy().argmax(1)) if cosines.device.type == "cpu" else cosines.argmax(1)
+        nearest.append(index)
+        row_best.append(cosines.gather(1, index[:, None])[:, 0])
+        torch.maximum(column_best, cosines.amax(0), out=column_best)
+    rows1, best = torch.cat(nearest), torch.cat(row_best)
+    rows0 = torch.nonzero((best == column_best[rows1]) & (best > min_cosine))[:, 0]
+    rows0 = rows0[_first_of_each(rows1[rows0])]  # equal descriptors tie: one match for each
+    return rows0, rows1[rows0], best[rows0]
+
+
+def _first_of_each(values: Tensor) -> Tensor:
+    _, first = np.unique(values.cpu().numpy(), return_index=True)
+    return torch.from_numpy(np.sort(first)).to(values.device)
+
+
+def _wanted(crop: Crop, points: Float[np.ndarray, "M 2"]) -> Bool[np.ndarray, " M"]:
+    """Which points (M, 2) lie inside the crop and its mask."""
+    inside: np.ndarray = np.all((points >= 0) & (points < crop.size), axis=1)
+    if (mask := crop.mask()) is not None:
+        x, y = np.minimum(points.clip(0).astype(int), np.array(crop.size) - 1).T
+        inside &= mask[y, x]
+    return inside
+
+
+def _device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise OptionError(f"device '{name}' cannot be used ({reason}); try 'cpu', or 'cuda' with a GPU") from error
+    return device

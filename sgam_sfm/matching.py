@@ -1,0 +1,105 @@
+"""Match the pairs of a collection, block by block, into the store."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+from sgam_core import AreaMatcher, Image, PairResult, PointMatcher, WholeImages, match_described
+from sgam_core.errors import SGAMError
+from sgam_sfm.database import camera_matrix
+from sgam_sfm.images import read_image, read_mask
+from sgam_sfm.inputs import Inputs
+from sgam_sfm.label_maps import LabelMaps
+from sgam_sfm.options import MatchOptions
+from sgam_sfm.pairs import Pair
+from sgam_sfm.progress import Stages
+from sgam_sfm.store import PairRecord, PairStore
+
+_log = logging.getLogger(__name__)
+_IMAGES_IN_MEMORY = 18  # the images of one block of pairs, and a little more
+_DESCRIPTIONS_IN_MEMORY = 1024  # about 1 MB each
+
+
+def match_blocks(
+    work: Sequence[Sequence[Pair]], store: PairStore, matcher: CollectionMatcher, stages: Stages
+) -> Counter[str]:
+    """Match every block that the store does not hold yet, and give the seconds that each step took.
+
+    A block follows from its pairs and the options alone: the point matcher starts each one with empty caches, so that
+    what it did before cannot decide how it batches.
+    """
+    with stages.stage("Matching pairs", sum(map(len, work))) as advance:
+        for index, block in enumerate(work):
+            if store.has(index):
+                advance(len(block))
+                continue
+            matcher.start_block()
+            records = []
+            for pair in block:
+                records.append(matcher.match(pair))
+                advance(1)
+            store.write(index, records)
+    return matcher.seconds
+
+
+class CollectionMatcher:
+    """Matches pairs of one collection by name; images are read and described once while they stay in memory."""
+
+    def __init__(
+        self,
+        options: MatchOptions,
+        inputs: Inputs,
+        labels: LabelMaps | None,
+        area_matcher: AreaMatcher,
+        point_matcher: PointMatcher,
+    ) -> None:
+        self._options, self._inputs, self._labels = options, inputs, labels
+        self._area_matcher, self._point_matcher = area_matcher, point_matcher
+        self._image = lru_cache(_IMAGES_IN_MEMORY)(self._read_image)
+        self._description = lru_cache(_DESCRIPTIONS_IN_MEMORY)(self._describe)
+        self.seconds: Counter[str] = Counter()
+
+    def start_block(self) -> None:
+        """Empty the point matcher's caches, where it has any."""
+        reset = getattr(self._point_matcher, "reset", None)
+        if reset is not None:
+            reset()
+
+    def match(self, pair: Pair) -> PairRecord:
+        """The record of one pair; an error of its images becomes part of it."""
+        try:
+            result = self._match(pair)
+        except SGAMError as error:
+            _log.warning("%s - %s: %s", *pair, error)
+            return PairRecord(pair=pair, result=None, error=str(error))
+        self.seconds.update(result.seconds)
+        return PairRecord(pair=pair, result=result)
+
+    def _match(self, pair: Pair) -> PairResult:
+        image0, image1 = (self._image(name) for name in pair)
+        failed = {} if self._labels is None else self._labels.failed
+        reason = next((failed[name] for name in pair if name in failed), "")
+        if reason:
+            whole = match_described(
+                image0, image1, None, None, WholeImages(), self._point_matcher, self._options.sgam
+            )
+            return replace(whole, fallback=f"no label map: {reason}")
+        described = (self._description(name) for name in pair)
+        return match_described(
+            image0, image1, *described, self._area_matcher, self._point_matcher, self._options.sgam
+        )
+
+    def _read_image(self, name: str) -> Image:
+        file = self._inputs.images[name]
+        mask = read_mask(self._options.mask_path, file) if self._options.mask_path else None
+        matrix = camera_matrix(self._inputs.cameras[name])
+        return Image(name=name, pixels=read_image(file), mask=mask, camera_matrix=matrix)
+
+    def _describe(self, name: str) -> Any:
+        labels = None if self._labels is None else self._labels.read(name)
+        return self._area_matcher.describe(self._image(name), labels)

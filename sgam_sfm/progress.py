@@ -1,0 +1,60 @@
+"""Stages of a run: a progress bar with an ETA while one lasts, its seconds and peak memory once it is over."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+Advance = Callable[[float], None]
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class Stages:
+    """Shows and times the stages of one run. quiet: no bars."""
+
+    quiet: bool = False
+    seconds: dict[str, float] = field(default_factory=dict)
+    console: Console = field(default_factory=lambda: Console(stderr=True))
+
+    @contextmanager
+    def stage(self, name: str, total: float | None) -> Iterator[Advance]:
+        """Run one stage; yields a function that adds to its progress. total: None when it cannot be known."""
+        _log.info("%s ...", name)
+        start = time.perf_counter()
+        columns = (
+            TextColumn("{task.description:<22}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("ETA"),
+            TimeRemainingColumn(elapsed_when_finished=False),
+        )
+        try:
+            with Progress(*columns, console=self.console, disable=self.quiet) as bars:
+                task = bars.add_task(name, total=total)
+                yield lambda amount: bars.advance(task, amount)
+                bars.update(task, total=total or 1, completed=total or 1)
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            _log.info("%s: %.1f s", name, self.seconds[name])
+
+
+def peak_memory_mb() -> dict[str, float]:
+    """Peak resident memory of this process and of its largest finished child, MB; empty where it cannot be told."""
+    if sys.platform == "win32":
+        return {}
+    import resource
+
+    unit = 2**20 if sys.platform == "darwin" else 2**10  # bytes there, kilobytes elsewhere
+    return {
+        "process": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit,
+        "child": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / unit,
+    }

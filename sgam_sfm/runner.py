@@ -1,0 +1,184 @@
+"""The whole run: photos and a pair list in, a COLMAP database and model out."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sgam_core import AreaMatcher, Matches, PointMatcher
+from sgam_core.errors import OptionError
+from sgam_core.geometry import residuals
+from sgam_sfm import registry
+from sgam_sfm.database import write_database
+from sgam_sfm.files import write_json
+from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
+from sgam_sfm.inputs import Inputs, read_inputs
+from sgam_sfm.keypoints import merge_keypoints
+from sgam_sfm.label_maps import make_label_maps
+from sgam_sfm.mapping import (
+    MappingOptions,
+    MappingSummary,
+    VerificationOptions,
+    VerificationSummary,
+    map_images,
+    verify,
+)
+from sgam_sfm.matching import CollectionMatcher, match_blocks
+from sgam_sfm.options import NOT_IN_RESULTS, MatchOptions, as_json, fingerprint
+from sgam_sfm.pairs import Pair, blocks
+from sgam_sfm.progress import Stages, peak_memory_mb
+from sgam_sfm.store import PairStore
+from sgam_sfm.summary import summarise_inputs, summarise_keypoints, summarise_pairs, versions
+
+
+def match_collection(options: MatchOptions, stages: Stages | None = None) -> dict[str, Any]:
+    """Match a collection and reconstruct it with COLMAP; started again, it continues where it stopped.
+
+    Args: stages shows progress and keeps times; none by default.
+    Returns: the content of OUT/summary.json.
+    Raises: SGAMError for what cannot be used at all. Single images and pairs that fail are counted in the summary.
+    """
+    stages = stages or Stages(quiet=True)
+    options = replace(options, device=_device(options.device))
+    _use_threads(options.threads)
+    point_matcher: PointMatcher = registry.create(
+        "matcher", options.matcher, weights=options.weights, device=options.device, seed=options.seed
+    )
+    area_matcher: AreaMatcher = registry.create("area-matcher", options.area_matcher, options=options.sgam)
+    output = options.output
+
+    inputs = read_inputs(options, stages)
+    store = open_store(options, inputs)
+    labels = make_label_maps(options, inputs.images, stages) if options.area_matcher == "sgam" else None
+    work = blocks(inputs.pairs.pairs)
+    matcher = CollectionMatcher(options, inputs, labels, area_matcher, point_matcher)
+    steps = match_blocks(work, store, matcher, stages)
+
+    with stages.stage("Merging keypoints", None):
+        matches, inliers = stored_matches(store, len(work), options)
+        merged = merge_keypoints(matches, options.keypoints, inliers)
+        write_keypoints_h5(output / "keypoints.h5", merged.keypoints)
+        counts = {name: len(points) for name, points in merged.keypoints.items()}
+        write_matches_h5(output / "matches.h5", merged.matches, merged.scores, counts)
+        write_database(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
+    verified, mapped = reconstruct(options, inputs, stages)
+
+    facts = summarise_inputs(inputs)
+    pairs = summarise_pairs(store.read_all(len(work)))
+    summary = {
+        "images": facts["images"],
+        "pairs": facts["pairs"] | pairs | {"verified": len(verified.inliers), "inliers": sum(verified.inliers.values())},
+        "labels": {} if labels is None else {"failed": labels.failed, **labels.facts},
+        "keypoints": summarise_keypoints(merged),
+        "models": [] if mapped is None else mapped.models,
+        "no_model": "mapping was not asked for (--no-mapping)" if mapped is None else mapped.reason,
+        "seconds": stages.seconds,
+        "matching_seconds": steps,
+        "peak_memory_mb": peak_memory_mb(),
+        "device": options.device,
+        "versions": versions(),
+    }
+    write_json(output / "summary.json", summary)
+    return json.loads((output / "summary.json").read_text(encoding="utf-8"))
+
+
+def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
+    """The store of raw results in OUT, bound to options and inputs, which are written to OUT/options.json.
+
+    Raises: OptionError when OUT was begun with others, naming them.
+    """
+    mark = fingerprint(
+        options, images={name: file.digest for name, file in inputs.images.items()}, pairs=inputs.pairs.pairs
+    )
+    path = options.output / "options.json"
+    now = as_json(options) | {"fingerprint": mark}
+    if path.exists():
+        before = json.loads(path.read_text(encoding="utf-8"))
+        if before["fingerprint"] != mark:
+            raise OptionError(
+                f"'{options.output}' was begun with other {difference(before, now)}; choose a new --output folder"
+            )
+    write_json(path, now)
+    return PairStore(folder=options.output / "pairs", fingerprint=mark)
+
+
+def difference(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """Which options differ, for a message; the images or pairs when none does."""
+    changed = [
+        f"--{name.replace('_', '-')} ({before.get(name)} there, {now[name]} here)"
+        for name in now
+        if name not in NOT_IN_RESULTS | {"fingerprint"} and before.get(name) != now[name]
+    ]
+    return ", ".join(changed) or "images or pairs"
+
+
+def stored_matches(
+    store: PairStore, num_blocks: int, options: MatchOptions
+) -> tuple[dict[Pair, Matches], dict[Pair, np.ndarray]]:
+    """The point matches of every pair that has any, and (M,) which of them agree with the pair's geometry."""
+    matches, inliers = {}, {}
+    for record in store.read_all(num_blocks):
+        if record.result is not None and len(record.result.matches):
+            matches[record.pair] = record.result.matches
+            model = record.result.two_view
+            if model is not None:
+                inliers[record.pair] = residuals(model.F, record.result.matches) <= options.geometry.max_residual
+    return matches, inliers
+
+
+def reconstruct(
+    options: MatchOptions, inputs: Inputs, stages: Stages
+) -> tuple[VerificationSummary, MappingSummary | None]:
+    """COLMAP's verification, then its mapper unless --no-mapping."""
+    database = options.output / "database.db"
+    with stages.stage("Verifying pairs", None):
+        verified = verify(database, VerificationOptions(seed=options.seed, threads=options.threads or -1))
+    if not options.mapping:
+        return verified, None
+    with stages.stage("Mapping", len(inputs.images)) as advance:
+        shown = 0
+
+        def progress(step: str, done: int, total: int) -> None:
+            nonlocal shown
+            advance(done - shown)
+            shown = done
+
+        mapped = map_images(
+            database,
+            options.images,
+            options.output / "sparse",
+            MappingOptions(mapper=options.mapper, refine_intrinsics=options.refine_intrinsics, seed=options.seed),
+            progress,
+            known_camera_ids={camera.camera_id for camera in inputs.cameras.values() if camera.known},
+        )
+    return verified, mapped
+
+
+def _device(name: str) -> str:
+    """`auto` becomes cuda where there is one.
+
+    Raises: OptionError for a device that this machine does not have.
+    """
+    import torch
+
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise OptionError(f"--device '{name}' cannot be used ({reason}); use cpu or auto") from error
+    return name
+
+
+def _use_threads(number: int) -> None:
+    """Let torch and OpenCV use this many CPU threads (0: all)."""
+    import cv2
+    import torch
+
+    if number:
+        torch.set_num_threads(number)
+        cv2.setNumThreads(number)

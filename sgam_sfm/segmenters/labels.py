@@ -1,0 +1,55 @@
+"""Label maps made by someone else: a folder of PNG files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from jaxtyping import Int32
+
+from sgam_core.errors import InputError, SGAMError
+from sgam_sfm.images import ImageFile, read_label_map
+
+
+class LabelFolder:
+    """Reads the labels of `sub/a.jpg` from `<folder>/sub/a.jpg.png` or `<folder>/sub/a.png`.
+
+    8 or 16 bits, any ids, 0 = void; the ids mean the same thing in every image (ScanNet, Cityscapes, KITTI-360, or the
+    export of any segmentation model).
+
+    Raises: InputError when the folder does not exist.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise InputError(f"label folder '{folder}' does not exist; give the folder that holds the label maps")
+        self.folder = folder
+
+    def segment(
+        self, images: Sequence[ImageFile], advance: Callable[[float], None]
+    ) -> Iterator[tuple[ImageFile, Int32[np.ndarray, "H W"] | Exception]]:
+        for image in images:
+            try:
+                labels: np.ndarray | SGAMError = self._labels(image)
+            except SGAMError as error:
+                labels = error
+            advance(1.0)
+            yield image, labels
+
+    def _labels(self, image: ImageFile) -> Int32[np.ndarray, "H W"]:
+        candidates = (f"{image.name}.png", PurePosixPath(image.name).with_suffix(".png").as_posix())
+        found = [name for name in dict.fromkeys(candidates) if (self.folder / name).is_file()]
+        if not found:
+            raise InputError(
+                f"no labels for '{image.name}'; expected '{candidates[0]}' or '{candidates[1]}' in '{self.folder}'"
+            )
+        if len(found) > 1:
+            raise InputError(f"two label maps for '{image.name}': '{found[0]}' and '{found[1]}'; keep one of them")
+        labels = read_label_map(self.folder / found[0])
+        if labels.shape != (image.height, image.width):
+            raise InputError(
+                f"labels for '{image.name}' are {labels.shape[0]}x{labels.shape[1]} but the image is "
+                f"{image.height}x{image.width} (height x width); export them again at the image's size"
+            )
+        return labels

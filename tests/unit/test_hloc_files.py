@@ -1,0 +1,91 @@
+"""Our HDF5 files as hloc reads them."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+
+from sgam_core.errors import InputError, ShapeError
+from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
+
+
+def hloc_keypoints(path, name):
+    """What hloc.utils.io.get_keypoints does."""
+    with h5py.File(path, "r", libver="latest") as file:
+        return file[name]["keypoints"].__array__()
+
+
+def hloc_matches(path, name0, name1):
+    """What hloc.utils.io.get_matches does."""
+    with h5py.File(path, "r", libver="latest") as file:
+        names = [name.replace("/", "-") for name in (name0, name1)]
+        reverse = "/".join(names) not in file
+        group = file["/".join(reversed(names) if reverse else names)]
+        matches, scores = group["matches0"].__array__(), group["matching_scores0"].__array__()
+    index = np.where(matches != -1)[0]
+    pairs = np.stack([index, matches[index]], -1)
+    return (np.flip(pairs, -1) if reverse else pairs), scores[index]
+
+
+def test_keypoints_have_their_origin_at_the_first_pixel_centre(tmp_path):
+    path = tmp_path / "keypoints.h5"
+    write_keypoints_h5(path, {"sub/a.jpg": np.array([[0.5, 0.5], [10.25, 3.0]]), "b.jpg": np.zeros((0, 2))})
+    read = hloc_keypoints(path, "sub/a.jpg")
+    assert read.dtype == np.float32
+    np.testing.assert_array_equal(read, [[0, 0], [9.75, 2.5]])
+    assert hloc_keypoints(path, "b.jpg").shape == (0, 2)
+
+
+def test_matches_read_back_in_both_directions(tmp_path):
+    path = tmp_path / "matches.h5"
+    pairs = {
+        ("sub/a.jpg", "b.jpg"): np.array([[4, 0], [1, 2]], np.uint32),
+        ("b.jpg", "c.jpg"): np.zeros((0, 2), np.uint32),
+    }
+    scores = {("sub/a.jpg", "b.jpg"): np.array([0.5, 1.0], np.float32), ("b.jpg", "c.jpg"): np.zeros(0, np.float32)}
+    write_matches_h5(path, pairs, scores, {"sub/a.jpg": 5, "b.jpg": 3, "c.jpg": 0})
+    matches, values = hloc_matches(path, "sub/a.jpg", "b.jpg")
+    np.testing.assert_array_equal(matches, [[1, 2], [4, 0]])
+    np.testing.assert_array_equal(values, [1.0, 0.5])
+    np.testing.assert_array_equal(hloc_matches(path, "b.jpg", "sub/a.jpg")[0], [[2, 1], [0, 4]])
+    assert len(hloc_matches(path, "b.jpg", "c.jpg")[0]) == 0
+    with h5py.File(path) as file:
+        assert file["sub-a.jpg/b.jpg/matches0"].dtype == np.int32
+        assert file["sub-a.jpg/b.jpg/matches0"].shape == (5,)
+        assert file["sub-a.jpg/b.jpg/matching_scores0"].dtype == np.float16
+
+
+def test_names_that_hloc_cannot_tell_apart(tmp_path):
+    one = np.zeros((0, 2), np.uint32)
+    matches = {("a/b.jpg", "c.jpg"): one, ("a-b.jpg", "c.jpg"): one}
+    with pytest.raises(InputError) as error:
+        write_matches_h5(tmp_path / "m.h5", matches, dict.fromkeys(matches, np.zeros(0)), {})
+    assert str(error.value) == (
+        "images 'a-b.jpg' and 'a/b.jpg' are both 'a-b.jpg' in hloc's matches file, which writes '/' as '-'; rename one "
+        "of them"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("indices", "message"),
+    [
+        ([[0, 3]], "point beyond its 2 and 3 keypoints"),
+        ([[2, 0]], "point beyond its 2 and 3 keypoints"),
+        ([[0, 1], [0, 2]], "use a keypoint of 'a' twice"),
+    ],
+)
+def test_a_failed_write_leaves_the_old_file(tmp_path, indices, message):
+    path = tmp_path / "m.h5"
+    path.write_bytes(b"old")
+    matches = {("a", "b"): np.array(indices)}
+    with pytest.raises(ShapeError, match=message):
+        write_matches_h5(path, matches, {("a", "b"): np.ones(len(indices))}, {"a": 2, "b": 3})
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_keypoints_of_another_shape(tmp_path):
+    with pytest.raises(ShapeError, match=r"keypoints of 'a' have shape \(4, 3\); expected \(N, 2\)"):
+        write_keypoints_h5(tmp_path / "k.h5", {"a": np.zeros((4, 3))})
