@@ -50,7 +50,7 @@ def run(arguments: Sequence[str]) -> int:
     console = Console(stderr=True)
     try:
         command = tyro.cli(
-            Annotated[  # type: ignore[arg-type]
+            Annotated[
                 Annotated[MatchOptions, tyro.conf.subcommand("match", default=_defaults(arguments))]
                 | Annotated[DemoOptions, tyro.conf.subcommand("demo")],
                 tyro.conf.OmitSubcommandPrefixes,

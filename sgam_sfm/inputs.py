@@ -78,4 +78,3 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
         num_other_files=num_other_files,
         pairs=pairs,
     )
-

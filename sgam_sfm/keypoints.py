@@ -33,23 +33,23 @@ logger = logging.getLogger(__name__)
 
 Pair = tuple[str, str]
 
-_MIN_SCORE = 1e-3  # a match of score 0 still has a place
+_MIN_WEIGHT = 1e-3  # a match of score 0 still has a place
 _OCTAVE = 2.0  # points whose sigma is so many times the finest have no say in where a keypoint lies
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class KeypointOptions:
-    """How far the points of one image may lie apart and still be one keypoint; all radii in matcher pixels."""
+    """How far the points of one image may lie apart and still be one keypoint; radii in matcher pixels."""
 
     cluster_radius_px: float = 0.33  # points of one image within it are one keypoint
     track_radius_px: float = 5.0  # keypoints of one image within it may become one in a track; 0: never
     min_shared_images: int = 2  # join two tracks that run within the track radius in so many images; 0: never
-    max_residual_px: float = 1.5  # drop a match that is further than this from its aligned keypoints; 0: keep all
+    max_residual_sigmas: float = 1.5  # drop a match further from its aligned keypoints; sigma: 1 px either side; 0: off
 
     def __post_init__(self) -> None:
         if not self.cluster_radius_px > 0:
             raise OptionError(f"cluster_radius_px is {self.cluster_radius_px}; expected a positive number")
-        for name in ("track_radius_px", "min_shared_images", "max_residual_px"):
+        for name in ("track_radius_px", "min_shared_images", "max_residual_sigmas"):
             if not getattr(self, name) >= 0:
                 raise OptionError(f"{name} is {getattr(self, name)}; expected 0 (off) or a positive number")
 
@@ -84,6 +84,7 @@ class _Columns:
     points: np.ndarray  # (2, M, 2) image pixels
     sigmas: np.ndarray  # (2, M) image pixels per matcher pixel
     scores: np.ndarray  # (M,)
+    weights: np.ndarray  # (M,) scores, but never 0
     inlier: np.ndarray  # (M,) consistent with the robust geometry of its pair
     affine: np.ndarray  # (M, 2, 2) local map from side 0 to side 1
 
@@ -108,7 +109,7 @@ def merge_keypoints(
     finest = _finest(index, raw.sigmas, len(keypoints))
 
     variances = raw.sigmas[1] ** 2 + np.abs(np.linalg.det(raw.affine)) * raw.sigmas[0] ** 2
-    edges = _strongest_first(index, raw.scores / variances, raw.inlier)
+    edges = _strongest_first(index, raw.weights / variances, raw.inlier)
     track, joined = link_tracks(keypoints, image, finest, edges, options.track_radius_px, options.min_shared_images)
     linked = track[index[0]] == track[index[1]]
 
@@ -122,11 +123,11 @@ def merge_keypoints(
         raw.points[:, linked],
         raw.affine[linked],
         variances[linked],
-        raw.scores[linked],
+        raw.weights[linked],
     )
     exported = linked.copy()
-    if options.max_residual_px > 0:
-        exported[linked] = residuals <= options.max_residual_px
+    if options.max_residual_sigmas > 0:
+        exported[linked] = residuals <= options.max_residual_sigmas
     return _export(raw, aligned, image, index, linked, exported)
 
 
@@ -141,7 +142,7 @@ def merge_image(
     Fine points come first, an octave of sigma at a time: the densest spots become clusters, and every point goes to the
     nearest cluster within the radius. Coarser points join a finer cluster in reach without moving it.
 
-    Args: points: pixels. sigmas: image pixels per matcher pixel. scores: in [0, 1]. radius_px: in matcher pixels.
+    Args: points: pixels. sigmas: image pixels per matcher pixel. scores: above 0. radius_px: in matcher pixels.
     Returns: keypoints, the means of the points of the cluster's finest octave weighted by score / sigma^2; the keypoint
         of every point.
     """
@@ -224,7 +225,7 @@ def _collect(pairs: Mapping[Pair, Matches], inliers: Mapping[Pair, np.ndarray]) 
         images.append(np.tile([[row_of[first]], [row_of[second]]], len(matches)))
         points.append(np.stack([matches.points0, matches.points1]))
         sigmas.append(np.stack([matches.sigmas0, matches.sigmas1]).astype(np.float64))
-        scores.append(np.maximum(matches.scores.astype(np.float64), _MIN_SCORE))
+        scores.append(matches.scores)
         inlier.append(mask)
         affine.append(local_affine(matches.points0, matches.points1, mask))
     return _Columns(
@@ -233,7 +234,8 @@ def _collect(pairs: Mapping[Pair, Matches], inliers: Mapping[Pair, np.ndarray]) 
         images=np.concatenate([np.zeros((2, 0), np.int64), *images], axis=1),
         points=np.concatenate([np.zeros((2, 0, 2)), *points], axis=1),
         sigmas=np.concatenate([np.zeros((2, 0)), *sigmas], axis=1),
-        scores=np.concatenate([np.zeros(0), *scores]),
+        scores=np.concatenate([np.zeros(0, np.float32), *scores]),
+        weights=np.maximum(np.concatenate([np.zeros(0), *scores]), _MIN_WEIGHT),
         inlier=np.concatenate([np.zeros(0, bool), *inlier]),
         affine=np.concatenate([np.zeros((0, 2, 2)), *affine]),
         pair=np.repeat(np.arange(len(scores)), [len(part) for part in scores]),
@@ -243,7 +245,7 @@ def _collect(pairs: Mapping[Pair, Matches], inliers: Mapping[Pair, np.ndarray]) 
 def _merge_images(raw: _Columns, radius_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """All keypoints (K, 2), numbered image by image, the image of each (K,), the keypoints of every match (2, M)."""
     index = np.zeros(raw.images.size, np.int64)
-    points, sigmas, scores = raw.points.reshape(-1, 2), raw.sigmas.ravel(), np.tile(raw.scores, 2)
+    points, sigmas, scores = raw.points.reshape(-1, 2), raw.sigmas.ravel(), np.tile(raw.weights, 2)
     by_image = np.argsort(raw.images, axis=None, kind="stable")
     bounds = np.searchsorted(raw.images.ravel()[by_image], np.arange(len(raw.names) + 1))
     keypoints = [np.zeros((0, 2))]
@@ -277,7 +279,7 @@ def _means(index: np.ndarray, raw: _Columns, count: int) -> np.ndarray:
     """Mean (count, 2) of the finest points of every keypoint; 0 for a keypoint that has none."""
     finest = _finest(index, raw.sigmas, count)
     fine = raw.sigmas < _OCTAVE * finest[index]
-    weights = np.where(fine, raw.scores / raw.sigmas**2, 0.0).ravel()
+    weights = np.where(fine, raw.weights / raw.sigmas**2, 0.0).ravel()
     total = np.bincount(index.ravel(), weights, count)
     points = raw.points.reshape(-1, 2)
     sums = [np.bincount(index.ravel(), weights * points[:, axis], count) for axis in (0, 1)]
@@ -297,7 +299,7 @@ def _export(
         kept = np.flatnonzero(exported[rows]) + rows.start
         unique, inverse = np.unique(number[index[:, kept]].T, axis=0, return_inverse=True)
         best = np.zeros(len(unique), np.float32)
-        np.maximum.at(best, inverse.reshape(-1), raw.scores[kept].astype(np.float32))
+        np.maximum.at(best, inverse.reshape(-1), raw.scores[kept])
         oriented = unique if pair[0] < pair[1] else unique[:, ::-1]
         matches[pair], scores[pair] = np.ascontiguousarray(oriented, np.uint32), best
     num_exported = sum(map(len, matches.values()))

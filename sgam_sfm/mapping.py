@@ -23,6 +23,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from sgam_core.errors import InputError, OptionError, StageError
@@ -113,6 +114,17 @@ class MappingSummary:
     peak_memory_mb: float | None
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PoseErrors:
+    """How a model's poses differ from the truth after a similarity alignment. center: in the truth's unit."""
+
+    num_images: int
+    median_center: float
+    max_center: float
+    median_rotation_deg: float
+    max_rotation_deg: float
+
+
 def verify(
     database_path: Path,
     options: VerificationOptions | None = None,
@@ -183,6 +195,24 @@ def map_images(
         shutil.rmtree(partial, ignore_errors=True)
     return MappingSummary(
         models=models, reason=result["reason"], seconds=seconds, peak_memory_mb=result["peak_memory_mb"]
+    )
+
+
+def compare_poses(model: Path, truth: Path, max_center_error: float = 0.1) -> PoseErrors:
+    """Align a model to the true one by their camera centres and compare the poses of the images they share.
+
+    Args: model, truth: folders with COLMAP models. max_center_error: of an inlier of the alignment, in the truth's unit.
+    Raises: StageError when they cannot be read or aligned.
+    """
+    job = {"stage": "comparison", "model": str(model), "truth": str(truth), "max_center_error": max_center_error}
+    result, _ = _run(job, model.parent.parent / "colmap.log", None)
+    rotations, centers = result["rotations_deg"], result["centers"]
+    return PoseErrors(
+        num_images=len(centers),
+        median_center=median(centers),
+        max_center=max(centers),
+        median_rotation_deg=median(rotations),
+        max_rotation_deg=max(rotations),
     )
 
 
@@ -367,6 +397,24 @@ def _map_globally(job: dict[str, Any], options: MappingOptions, all_fixed: bool,
     return list(pycolmap.global_mapping(database_path, job["images"], job["output"], pipeline).values())
 
 
+def _compare(job: dict[str, Any], send: Send) -> dict[str, Any]:
+    import pycolmap
+
+    found = pycolmap.compare_reconstructions(
+        pycolmap.Reconstruction(job["model"]),
+        pycolmap.Reconstruction(job["truth"]),
+        alignment_error="proj_center",
+        max_proj_center_error=job["max_center_error"],
+    )
+    if found is None:
+        raise RuntimeError(f"{job['model']} cannot be aligned to {job['truth']}")
+    errors = found["errors"]
+    return {
+        "rotations_deg": [error.rotation_error_deg for error in errors],
+        "centers": [error.proj_center_error for error in errors],
+    }
+
+
 def _summary(model: Any, folder: str, total: int) -> ModelSummary:
     model.update_point_3d_errors()
     distinct = [len({element.image_id for element in point.track.elements}) for point in model.points3D.values()]
@@ -424,7 +472,7 @@ def _main() -> None:
         channel.flush()
 
     job = json.load(sys.stdin)
-    stage = _verify if job["stage"] == "verification" else _map
+    stage = {"verification": _verify, "comparison": _compare}.get(job["stage"], _map)
     result = stage(job, lambda step, done, total: write({"step": step, "done": done, "total": total}))
     write({"result": {**result, "peak_memory_mb": _peak_memory_mb()}})
 

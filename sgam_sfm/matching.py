@@ -85,14 +85,10 @@ class CollectionMatcher:
         failed = {} if self._labels is None else self._labels.failed
         reason = next((failed[name] for name in pair if name in failed), "")
         if reason:
-            whole = match_described(
-                image0, image1, None, None, WholeImages(), self._point_matcher, self._options.sgam
-            )
+            whole = match_described(image0, image1, None, None, WholeImages(), self._point_matcher, self._options.sgam)
             return replace(whole, fallback=f"no label map: {reason}")
-        described = (self._description(name) for name in pair)
-        return match_described(
-            image0, image1, *described, self._area_matcher, self._point_matcher, self._options.sgam
-        )
+        described = (self._description(pair[0]), self._description(pair[1]))
+        return match_described(image0, image1, *described, self._area_matcher, self._point_matcher, self._options.sgam)
 
     def _read_image(self, name: str) -> Image:
         file = self._inputs.images[name]

@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal, cast, get_type_hints
 
 import tyro
 from pydantic import TypeAdapter, ValidationError
@@ -27,6 +27,7 @@ from sgam_core.options import (
 )
 from sgam_sfm.keypoints import KeypointOptions
 
+Preset = Literal["default", "paper", "scannet", "outdoor"]
 _STAGES = tuple(stage.name for stage in fields(SGAMOptions))
 
 
@@ -46,7 +47,7 @@ class MatchOptions:
     """Text file with `nameA nameB` a line (a tab between names with spaces). Without it: all pairs, up to 60 images."""
     config: Path | None = None
     """TOML or JSON file with any of these options (an options.json of an earlier run is one); flags win over it."""
-    preset: Literal["default", "paper", "scannet", "outdoor"] = "default"
+    preset: Preset = "default"
     """Values of the algorithm's options below; --config and flags win over it."""
 
     matcher: str = "xfeat-star"
@@ -124,7 +125,7 @@ def with_preset(options: MatchOptions, preset: str) -> MatchOptions:
     if preset not in PRESETS:
         raise OptionError(f"preset '{preset}' is unknown; known: {', '.join(PRESETS)}")
     stages = {stage: getattr(PRESETS[preset], stage) for stage in _STAGES}
-    return replace(options, preset=preset, **stages)
+    return replace(options, preset=cast(Preset, preset), **stages)
 
 
 def read_config(path: Path) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from sgam_sfm.options import NOT_IN_RESULTS, MatchOptions, as_json, fingerprint
 from sgam_sfm.pairs import Pair, blocks
 from sgam_sfm.progress import Stages, peak_memory_mb
 from sgam_sfm.store import PairStore
-from sgam_sfm.summary import summarise_inputs, summarise_keypoints, summarise_pairs, versions
+from sgam_sfm.summary import summarise_images, summarise_keypoints, summarise_pairs, versions
 
 
 def match_collection(options: MatchOptions, stages: Stages | None = None) -> dict[str, Any]:
@@ -66,11 +66,9 @@ def match_collection(options: MatchOptions, stages: Stages | None = None) -> dic
         write_database(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
     verified, mapped = reconstruct(options, inputs, stages)
 
-    facts = summarise_inputs(inputs)
-    pairs = summarise_pairs(store.read_all(len(work)))
     summary = {
-        "images": facts["images"],
-        "pairs": facts["pairs"] | pairs | {"verified": len(verified.inliers), "inliers": sum(verified.inliers.values())},
+        "images": summarise_images(inputs),
+        "pairs": summarise_pairs(inputs, store.read_all(len(work)), verified),
         "labels": {} if labels is None else {"failed": labels.failed, **labels.facts},
         "keypoints": summarise_keypoints(merged),
         "models": [] if mapped is None else mapped.models,

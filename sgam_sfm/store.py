@@ -131,3 +131,9 @@ def _read_record(group: h5py.Group) -> PairRecord:
             **(facts | {"notes": tuple(facts["notes"])}),
         ),
     )
+
+
+def read_pairs_of(output: Path) -> Iterator[PairRecord]:
+    """The records of a finished run, from its output folder."""
+    for path in sorted((output / "pairs").glob("*.h5")):
+        yield from PairStore(folder=path.parent, fingerprint="").read(int(path.stem))

@@ -12,32 +12,19 @@ from rich.table import Table
 
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.keypoints import CollectionKeypoints
+from sgam_sfm.mapping import VerificationSummary
 from sgam_sfm.store import PairRecord
 
 _PACKAGES = ("sgam-sfm", "pycolmap", "torch", "kornia", "numpy", "opencv-python-headless", "onnxruntime")
 
 
-def summarise_inputs(inputs: Inputs) -> dict[str, Any]:
-    """Images and pairs that a run works on, and those it cannot use."""
-    pairs = inputs.pairs
-    return {
-        "images": {
-            "used": len(inputs.images),
-            "failed": dict(inputs.failed),
-            "other_files": inputs.num_other_files,
-        },
-        "pairs": {
-            "listed": len(pairs.pairs),
-            "of_unusable_images": len(pairs.unreadable),
-            "repeated": pairs.num_repeated,
-            "reversed": pairs.num_reversed,
-            "self": pairs.num_self,
-        },
-    }
+def summarise_images(inputs: Inputs) -> dict[str, Any]:
+    """Images that the run works on, and those it cannot use."""
+    return {"used": len(inputs.images), "failed": dict(inputs.failed), "other_files": inputs.num_other_files}
 
 
-def summarise_pairs(records: Iterable[PairRecord]) -> dict[str, Any]:
-    """Areas, matches and fallbacks of all pairs."""
+def summarise_pairs(inputs: Inputs, records: Iterable[PairRecord], verified: VerificationSummary) -> dict[str, Any]:
+    """The pair list, and the areas, matches and fallbacks of all pairs."""
     areas: Counter[str] = Counter()
     fallbacks: Counter[str] = Counter()
     totals: Counter[str] = Counter()
@@ -62,6 +49,11 @@ def summarise_pairs(records: Iterable[PairRecord]) -> dict[str, Any]:
                 totals["areas_kept"] += 1
                 scale += (area.scale0 / result.whole_scale0 + area.scale1 / result.whole_scale1) / 2
     return {
+        "listed": len(inputs.pairs.pairs),
+        "of_unusable_images": len(inputs.pairs.unreadable),
+        "repeated": inputs.pairs.num_repeated,
+        "reversed": inputs.pairs.num_reversed,
+        "self": inputs.pairs.num_self,
         "matched": totals["pairs"],
         "failed": failed,
         "fallbacks": dict(sorted(fallbacks.items())),
@@ -71,6 +63,8 @@ def summarise_pairs(records: Iterable[PairRecord]) -> dict[str, Any]:
         "pairs_with_limits": totals["pairs_with_limits"],
         "raw_matches": totals["raw_matches"],
         "pixels_matched": totals["pixels_matched"],
+        "verified": len(verified.inliers),
+        "inliers": sum(verified.inliers.values()),
     }
 
 
@@ -107,7 +101,10 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
             f"{sum(n for k, n in pairs['areas'].items() if k.endswith('_rejected'))} rejected; "
             f"{pairs['mean_coverage']:.0%} of the image, {gain:.1f}x the resolution",
         )
-    table.add_row("fallbacks", ", ".join(f"{count} {reason}" for reason, count in pairs["fallbacks"].items()) or "none")
+    if pairs["areas"]:
+        table.add_row(
+            "fallbacks", ", ".join(f"{count} {reason}" for reason, count in pairs["fallbacks"].items()) or "none"
+        )
     table.add_row("matches", f"{pairs['raw_matches']} raw, {summary['keypoints']['matches']} as tracks")
     for number, model in enumerate(models):
         table.add_row(

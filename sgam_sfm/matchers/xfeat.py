@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from kornia.feature.xfeat import XFeatModel
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, normalize
@@ -27,6 +27,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Crop, Matches
+from sgam_sfm.matchers.masks import wanted
 from sgam_sfm.weights import XFEAT, find_weights
 
 CELL = 8  # pixels of the network's input per cell
@@ -128,7 +129,7 @@ class XFeatStar:
         points1 = (side1.centers + offsets1 / 2).cpu().numpy()
         scores = (cosines[sure] ** 4 * torch.sqrt(confidences0[sure] * confidences1)).clamp(0, 1).cpu().numpy()
 
-        good = (confidences1 > self.min_confidence).cpu().numpy() & _wanted(crop0, points0) & _wanted(crop1, points1)
+        good = (confidences1 > self.min_confidence).cpu().numpy() & wanted(crop0, points0) & wanted(crop1, points1)
         return Matches(points0=points0[good], points1=points1[good], scores=scores[good])
 
     def _features(self, crop: Crop) -> _Features:
@@ -161,7 +162,7 @@ class XFeatStar:
         centers = (CELL * torch.stack([cells_x, cells_y], -1).reshape(-1, 2) + CELL / 2) * step
         best = reliability.float().flatten().argsort(descending=True, stable=True)
         if crop.image.mask is not None:
-            best = best[torch.from_numpy(_wanted(crop, centers.cpu().numpy())).to(self.device)[best]]
+            best = best[torch.from_numpy(wanted(crop, centers.cpu().numpy())).to(self.device)[best]]
         best = best[:count]
         descriptors = maps.float()[0].flatten(1).T[best].contiguous()
         return _Features(descriptors, centers[best], step.expand(len(best), 2))
@@ -222,15 +223,6 @@ def _mutual_nearest(
 def _first_of_each(values: Tensor) -> Tensor:
     _, first = np.unique(values.cpu().numpy(), return_index=True)
     return torch.from_numpy(np.sort(first)).to(values.device)
-
-
-def _wanted(crop: Crop, points: Float[np.ndarray, "M 2"]) -> Bool[np.ndarray, " M"]:
-    """Which points (M, 2) lie inside the crop and its mask."""
-    inside: np.ndarray = np.all((points >= 0) & (points < crop.size), axis=1)
-    if (mask := crop.mask()) is not None:
-        x, y = np.minimum(points.clip(0).astype(int), np.array(crop.size) - 1).T
-        inside &= mask[y, x]
-    return inside
 
 
 def _device(name: str) -> torch.device:

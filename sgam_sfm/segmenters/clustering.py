@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float32, Int
+from scipy.cluster import vq
 from scipy.special import comb
 
 
@@ -39,22 +40,12 @@ def principal_components(samples: Float32[np.ndarray, "N C"], num_components: in
     return Projection(mean=mean, basis=np.ascontiguousarray(vectors[:, : -num_components - 1 : -1]))
 
 
-def kmeans(
-    points: Float32[np.ndarray, "N D"], num_clusters: int, rng: np.random.Generator, max_iterations: int = 50
-) -> Clusters:
-    """Lloyd's k-means from a k-means++ start; fewer clusters when there are fewer points."""
-    centers = _spread_start(points, min(num_clusters, len(points)), rng)
-    assignment = _squared_distances(points, centers).argmin(axis=1)
-    for _ in range(max_iterations):
-        member = (assignment[:, None] == np.arange(len(centers))).astype(np.float32)
-        counts = member.sum(axis=0)[:, None]
-        # A cluster that lost all its points stays where it is.
-        centers = np.where(counts > 0, (member.T @ points) / np.maximum(counts, 1), centers)
-        previous, assignment = assignment, _squared_distances(points, centers).argmin(axis=1)
-        if np.array_equal(previous, assignment):
-            break
-    inertia = float(np.square(points - centers[assignment]).sum(dtype=np.float64))
-    return Clusters(centers=centers, assignment=assignment, inertia=inertia)
+def kmeans(points: Float32[np.ndarray, "N D"], num_clusters: int, rng: np.random.Generator) -> Clusters:
+    """k-means from a k-means++ start; fewer clusters when there are not enough different points."""
+    # From given centres SciPy draws nothing at random, and it drops those that lose all their points.
+    centers, _ = vq.kmeans(points, _spread_start(points, num_clusters, rng))
+    assignment, distances = vq.vq(points, centers)
+    return Clusters(centers=centers, assignment=assignment, inertia=float(np.square(distances, dtype=np.float64).sum()))
 
 
 def stable_clusters(
@@ -93,17 +84,13 @@ def adjusted_rand_index(labels0: Int[np.ndarray, " N"], labels1: Int[np.ndarray,
     return 1.0 if largest == expected else float((together - expected) / (largest - expected))
 
 
-def _spread_start(points: np.ndarray, num_clusters: int, rng: np.random.Generator) -> np.ndarray:
+def _spread_start(points: np.ndarray, num_centers: int, rng: np.random.Generator) -> np.ndarray:
     """k-means++ (Arthur & Vassilvitskii, 2007): each next centre is drawn in proportion to its squared distance."""
-    chosen = [int(rng.integers(len(points)))]
+    centers = [points[rng.integers(len(points))]]
     nearest = np.full(len(points), np.inf)
-    while len(chosen) < num_clusters:
-        nearest = np.minimum(nearest, np.square(points - points[chosen[-1]]).sum(axis=1, dtype=np.float64))
-        total = nearest.sum()
-        chosen.append(int(rng.choice(len(points), p=nearest / total if total > 0 else None)))
-    return points[chosen]
-
-
-def _squared_distances(points: np.ndarray, centers: np.ndarray) -> np.ndarray:
-    """Up to a term that is the same for all centres."""
-    return np.square(centers).sum(axis=1) - 2 * points @ centers.T
+    while len(centers) < num_centers:
+        nearest = np.minimum(nearest, np.square(points - centers[-1]).sum(axis=1, dtype=np.float64))
+        if not nearest.any():
+            break
+        centers.append(points[rng.choice(len(points), p=nearest / nearest.sum())])
+    return np.stack(centers)

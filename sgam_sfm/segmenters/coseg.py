@@ -30,7 +30,7 @@ _SMOOTHING_SIGMA = 1.0  # patches: without it a sixth of a textured wall falls i
 _NUM_COMPONENTS = 32  # of 384: keeps about 80 % of the variance
 _CANDIDATES = (8, 10, 12, 14, 16)  # numbers of labels
 _NUM_RUNS = 5  # of k-means for each candidate
-_TOLERANCE = 0.02  # of agreement between runs, within which more labels are preferred
+_TOLERANCE = 0.05  # of agreement between runs: about its own noise; within it more labels, so more areas, are preferred
 _MAX_SAMPLES = 20_000  # patches that k-means sees
 _LABEL_MAP_WIDTH = 640  # pixels, as the layout constants of the method
 _FEATURE_SHARE = 0.9  # of an image's work
@@ -47,8 +47,8 @@ class CoSeg:
     k-means agree best. cache_folder: where features are kept between runs. image_size: pixels of the longer side at
     which images enter the network. threads: 0 = as many as there are cores.
 
-    After a run, `num_labels_chosen` is the number of labels, and `stability` how well runs of k-means agreed (their mean
-    adjusted Rand index) for every number that was tried.
+    After a run, `num_labels_chosen` is the number of labels, and `stability` how well runs of k-means agreed (mean
+    adjusted Rand index), for every number that was tried.
 
     Raises: WeightsError when there are no weights; OptionError for an option out of range.
     """

@@ -34,7 +34,7 @@ options = st.builds(
     cluster_radius_px=st.sampled_from([0.1, 0.33, 2.0]),
     track_radius_px=st.sampled_from([0.0, 2.0, 6.0]),
     min_shared_images=st.integers(0, 3),
-    max_residual_px=st.sampled_from([0.0, 1.5]),
+    max_residual_sigmas=st.sampled_from([0.0, 1.5]),
 )
 
 
@@ -93,7 +93,7 @@ def test_the_order_of_pairs_changes_nothing_and_a_reversed_pair_has_reversed_mat
 @settings(max_examples=30, deadline=None)
 @given(collections(), st.sampled_from([0.5, 2.0, 8.0]))
 def test_a_larger_image_with_a_larger_sigma_gives_the_same_tracks(pairs, zoom):
-    expected = merge_keypoints(pairs, KeypointOptions(max_residual_px=0))
+    expected = merge_keypoints(pairs, KeypointOptions(max_residual_sigmas=0))
     zoomed = {
         pair: Matches(
             points0=m.points0 * zoom,
@@ -104,7 +104,7 @@ def test_a_larger_image_with_a_larger_sigma_gives_the_same_tracks(pairs, zoom):
         )
         for pair, m in pairs.items()
     }
-    merged = merge_keypoints(zoomed, KeypointOptions(max_residual_px=0))
+    merged = merge_keypoints(zoomed, KeypointOptions(max_residual_sigmas=0))
     for pair, rows in expected.matches.items():
         np.testing.assert_array_equal(merged.matches[pair], rows)
     for name, points in expected.keypoints.items():

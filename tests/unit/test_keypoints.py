@@ -138,9 +138,9 @@ def test_link_tracks_keeps_the_finer_of_two_keypoints_that_become_one():
 def test_a_match_far_from_its_aligned_keypoints_is_dropped():
     steps = np.array([[0.0, 0.0], [4.0, 0.0]])
     pairs = {("a", "b"): matches(steps + 10, steps * [[1, 1], [2, 1]] + 20)}  # b is 4 px out for the second match
-    options = KeypointOptions(cluster_radius_px=0.1, track_radius_px=9, min_shared_images=2, max_residual_px=1)
+    options = KeypointOptions(cluster_radius_px=0.1, track_radius_px=9, min_shared_images=2, max_residual_sigmas=1)
     assert len(merge_keypoints(pairs, options).matches["a", "b"]) == 0
-    kept = merge_keypoints(pairs, KeypointOptions(cluster_radius_px=0.1, track_radius_px=9, max_residual_px=0))
+    kept = merge_keypoints(pairs, KeypointOptions(cluster_radius_px=0.1, track_radius_px=9, max_residual_sigmas=0))
     assert len(kept.matches["a", "b"]) == 1
 
 
