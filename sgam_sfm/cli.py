@@ -79,9 +79,11 @@ def _defaults(arguments: Sequence[str]) -> Any:
     known, _ = early.parse_known_args(arguments)
     content = read_config(known.config) if known.config else {}
     content.pop("fingerprint", None)  # of an options.json
-    options = MatchOptions(images=tyro.MISSING, output=tyro.MISSING)
-    options = with_preset(options, known.preset or content.get("preset", "default"))
-    return replace(merged(options, content), preset=options.preset, config=known.config)
+    preset = known.preset or content.get("preset", "default")
+    options = merged(with_preset(MatchOptions(images=Path(), output=Path()), preset), content | {"preset": preset})
+    for name in {"images", "output"} - content.keys():
+        object.__setattr__(options, name, tyro.MISSING)  # no Path: tells tyro that the flag is required
+    return options
 
 
 def _match(options: MatchOptions, console: Console) -> int:

@@ -36,6 +36,9 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
 
     Raises: InputError when nothing is left to match; single images that cannot be used are set aside.
     """
+    for flag, folder in (("--mask-path", options.mask_path), ("--labels", options.labels)):
+        if folder is not None and not folder.is_dir():
+            raise InputError(f"{flag} '{folder}' does not exist; give the folder that holds <image name>.png")
     names, num_other_files = list_images(options.images)
     images: dict[str, ImageFile] = {}
     failed: dict[str, str] = {}

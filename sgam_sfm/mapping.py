@@ -201,7 +201,8 @@ def map_images(
 def compare_poses(model: Path, truth: Path, max_center_error: float = 0.1) -> PoseErrors:
     """Align a model to the true one by their camera centres and compare the poses of the images they share.
 
-    Args: model, truth: folders with COLMAP models. max_center_error: of an inlier of the alignment, in the truth's unit.
+    Args: model, truth: folders with COLMAP models. max_center_error: of an inlier of the alignment, in the truth's
+        unit.
     Raises: StageError when they cannot be read or aligned.
     """
     job = {"stage": "comparison", "model": str(model), "truth": str(truth), "max_center_error": max_center_error}

@@ -21,7 +21,6 @@ from sgam_sfm.progress import Stages
 from sgam_sfm.store import PairRecord, PairStore
 
 _log = logging.getLogger(__name__)
-_IMAGES_IN_MEMORY = 18  # the images of one block of pairs, and a little more
 _DESCRIPTIONS_IN_MEMORY = 1024  # about 1 MB each
 
 
@@ -60,7 +59,7 @@ class CollectionMatcher:
     ) -> None:
         self._options, self._inputs, self._labels = options, inputs, labels
         self._area_matcher, self._point_matcher = area_matcher, point_matcher
-        self._image = lru_cache(_IMAGES_IN_MEMORY)(self._read_image)
+        self._image = lru_cache(2 * options.block_images)(self._read_image)  # those of one block
         self._description = lru_cache(_DESCRIPTIONS_IN_MEMORY)(self._describe)
         self.seconds: Counter[str] = Counter()
 

@@ -80,6 +80,8 @@ class MatchOptions:
     mapping: bool = True
     """Make a model; --no-mapping stops after the geometric verification."""
 
+    block_images: int = 8
+    """A block of pairs, the unit of work and of resume, joins up to this many images with as many others."""
     device: str = "auto"
     """auto, cpu, cuda, cuda:1, ..."""
     threads: int = 0

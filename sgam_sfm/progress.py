@@ -47,14 +47,11 @@ class Stages:
             _log.info("%s: %.1f s", name, self.seconds[name])
 
 
-def peak_memory_mb() -> dict[str, float]:
-    """Peak resident memory of this process and of its largest finished child, MB; empty where it cannot be told."""
+def peak_memory_mb() -> float | None:
+    """Peak resident memory of this process, MB; None where it cannot be told."""
     if sys.platform == "win32":
-        return {}
+        return None
     import resource
 
     unit = 2**20 if sys.platform == "darwin" else 2**10  # bytes there, kilobytes elsewhere
-    return {
-        "process": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit,
-        "child": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / unit,
-    }
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

@@ -53,7 +53,7 @@ def match_collection(options: MatchOptions, stages: Stages | None = None) -> dic
     inputs = read_inputs(options, stages)
     store = open_store(options, inputs)
     labels = make_label_maps(options, inputs.images, stages) if options.area_matcher == "sgam" else None
-    work = blocks(inputs.pairs.pairs)
+    work = blocks(inputs.pairs.pairs, options.block_images)
     matcher = CollectionMatcher(options, inputs, labels, area_matcher, point_matcher)
     steps = match_blocks(work, store, matcher, stages)
 
@@ -75,7 +75,11 @@ def match_collection(options: MatchOptions, stages: Stages | None = None) -> dic
         "no_model": "mapping was not asked for (--no-mapping)" if mapped is None else mapped.reason,
         "seconds": stages.seconds,
         "matching_seconds": steps,
-        "peak_memory_mb": peak_memory_mb(),
+        "peak_memory_mb": {
+            "matching": peak_memory_mb(),
+            "verification": verified.peak_memory_mb,
+            "mapping": None if mapped is None else mapped.peak_memory_mb,
+        },
         "device": options.device,
         "versions": versions(),
     }

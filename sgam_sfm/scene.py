@@ -145,7 +145,7 @@ def write_scene(
             _write_view(folder, view, rendering)
             shown.append((view, rendering))
             advance(view)
-    _write_ground_truth(folder / "ground_truth", views)
+    write_ground_truth(folder / "ground_truth", views)
     pairs = [
         f"{first[0].name} {second[0].name}\n"
         for first, second in combinations(shown, 2)
@@ -170,7 +170,7 @@ def _mutual_overlap(first: tuple[View, Rendering], second: tuple[View, Rendering
     return (forth + back) / 2
 
 
-def _write_ground_truth(folder: Path, views: Sequence[View]) -> None:
+def write_ground_truth(folder: Path, views: Sequence[View]) -> None:
     """The views as a COLMAP text model without points."""
     cameras, images = [], []
     for index, view in enumerate(views, start=1):

@@ -8,6 +8,8 @@ from pathlib import Path
 import jaxtyping
 import pytest
 
+from tests.room import Room, small_room
+
 DATA = Path(os.environ.get("SGAM_SFM_DATA", Path(__file__).parents[1] / "../shared/data"))
 
 
@@ -19,6 +21,12 @@ def data() -> Path:
             pytest.fail(f"real images not found at '{DATA}', and SGAM_SFM_REQUIRE_DATA is set")
         pytest.skip(f"real images not found at '{DATA}'; set SGAM_SFM_DATA")
     return DATA
+
+
+@pytest.fixture(scope="session")
+def room() -> Room:
+    """The rendered room, in small."""
+    return small_room()
 
 
 @pytest.fixture

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
+import PIL.Image
 
 from sgam_core import Box, Crop, Image, Matches
+from sgam_sfm.pairs import write_pairs
 from sgam_sfm.scene import Rendering, View, correspond, demo_views, overlap, render
 
 WIDTH = 480
@@ -33,8 +37,8 @@ class Room:
 
 
 def small_room() -> Room:
-    """Eight views: five along the arc, three close-ups."""
-    views = {view.name: view for view in demo_views(WIDTH, 9)[:8]}
+    """Six views: four along the arc, and two close-ups."""
+    views = {view.name: view for view in demo_views(WIDTH, 8)[:6]}
     renderings = {name: render(view) for name, view in views.items()}
     images = {
         name: Image(name=name, pixels=renderings[name].pixels, camera_matrix=view.camera_matrix)
@@ -47,16 +51,21 @@ def small_room() -> Room:
 class TrueMatcher:
     """Finds what both crops really show, with noise in the crop's own pixels and a share of random outliers.
 
-    Where the crops share nothing it finds random pairs, as real matchers do on look-alikes.
+    Where the crops share nothing it finds random pairs, as real matchers do on look-alikes. Each pair of crops is
+    looked at once.
     """
 
     room: Room
     points: int = 300
     noise_px: float = 0.3
     outliers: float = 0.1
+    known: dict = field(default_factory=dict)
 
     def match(self, pairs: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
-        return [self._match(crop0, crop1) for crop0, crop1 in pairs]
+        for crop0, crop1 in pairs:
+            if (crop0.key, crop1.key) not in self.known:
+                self.known[crop0.key, crop1.key] = self._match(crop0, crop1)
+        return [self.known[crop0.key, crop1.key] for crop0, crop1 in pairs]
 
     def _match(self, crop0: Crop, crop1: Crop) -> Matches:
         rng = np.random.default_rng(zlib.crc32(repr((crop0.key, crop1.key)).encode()))
@@ -71,3 +80,17 @@ class TrueMatcher:
         found0 = np.concatenate([true0 + rng.normal(0, self.noise_px, true0.shape), random0])
         found1 = np.concatenate([true1 + rng.normal(0, self.noise_px, true1.shape), random1])
         return Matches(points0=found0, points1=found1, scores=rng.uniform(0.3, 1, len(found0)))
+
+
+def write_room(room: Room, folder: Path) -> Path:
+    """The room as a user's folder: images/, labels/, pairs.txt (all pairs) and cameras.txt. Returns: the folder."""
+    for name, image in room.images.items():
+        for sub, pixels in (("images", image.pixels), ("labels", room.renderings[name].labels.astype(np.uint8))):
+            path = folder / sub / (name if sub == "images" else f"{name}.png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            PIL.Image.fromarray(pixels).save(path, quality=95)
+    write_pairs(folder / "pairs.txt", combinations(room.images, 2))
+    matrix = next(iter(room.views.values())).camera_matrix
+    params = " ".join(f"{value:.6f}" for value in (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+    (folder / "cameras.txt").write_text(f"* PINHOLE {WIDTH} {WIDTH * 3 // 4} {params}\n")
+    return folder

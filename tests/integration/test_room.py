@@ -15,30 +15,30 @@ from sgam_core import PairResult, SemanticAreaMatcher, SGAMOptions, match_descri
 from sgam_core.options import changed
 from sgam_sfm.keypoints import merge_keypoints
 from sgam_sfm.scene import correspond
-from tests.room import Room, TrueMatcher, small_room
+from tests.room import Room, TrueMatcher
 
 Results = dict[tuple[str, str], PairResult]
 
 
 @pytest.fixture(scope="module")
-def room() -> Room:
-    return small_room()
+def point_matcher(room: Room) -> TrueMatcher:
+    return TrueMatcher(room)
 
 
-def match_all(room: Room, options: SGAMOptions) -> Results:
+def match_all(room: Room, point_matcher: TrueMatcher, options: SGAMOptions) -> Results:
     matcher = SemanticAreaMatcher(options=options.semantic)
     described = {name: matcher.describe(image, room.renderings[name].labels) for name, image in room.images.items()}
     return {
         (a, b): match_described(
-            room.images[a], room.images[b], described[a], described[b], matcher, TrueMatcher(room), options
+            room.images[a], room.images[b], described[a], described[b], matcher, point_matcher, options
         )
         for a, b in combinations(room.images, 2)
     }
 
 
 @pytest.fixture(scope="module")
-def results(room: Room) -> Results:
-    return match_all(room, SGAMOptions())
+def results(room: Room, point_matcher: TrueMatcher) -> Results:
+    return match_all(room, point_matcher, SGAMOptions())
 
 
 def overlaps(room: Room, results: Results, state: str, predicted: bool | None = None) -> np.ndarray:
@@ -61,21 +61,21 @@ def errors(room: Room, pair: tuple[str, str], result: PairResult) -> np.ndarray:
 
 def test_areas_that_are_kept_show_the_same_part_of_the_room(room, results):
     kept = overlaps(room, results, "kept")
-    assert len(kept) >= 80
+    assert len(kept) >= 45
     assert kept.mean() > 0.45
     assert (kept > 0.2).mean() > 0.85
 
 
 def test_gr_rejects_what_does_not_overlap(room, results):
     rejected = overlaps(room, results, "rejected")
-    assert len(rejected) >= 15
+    assert len(rejected) >= 7
     assert rejected.mean() < 0.5 * overlaps(room, results, "kept").mean()
 
 
 def test_gp_finds_the_true_ones_among_look_alikes(room, results):
     chosen, left = overlaps(room, results, "kept", predicted=True), overlaps(room, results, "unresolved")
-    assert len(chosen) >= 20
-    assert len(left) >= 30
+    assert len(chosen) >= 11
+    assert len(left) >= 15
     assert chosen.mean() > 2 * left.mean()
 
 
@@ -89,26 +89,22 @@ def test_every_area_says_why_it_was_not_kept(results):
 
 def test_matches_of_overlapping_pairs_are_true(room, results):
     found = {pair: errors(room, pair, result) for pair, result in results.items() if len(result.matches) >= 300}
-    assert len(found) >= 10
+    assert len(found) >= 6
     for distances in found.values():
         assert np.median(distances) < 1.2
         assert (distances < 3).mean() > 0.7  # a tenth of the matcher's are outliers, and a few pixels lie on edges
 
 
-def test_gmc_adds_true_matches_where_areas_cover_little(room, results):
-    more = match_all(room, changed(SGAMOptions(), collection__min_coverage=1.0))
-    gained = 0
-    for pair, result in more.items():
-        if result.fallback:
-            continue
-        collected = result.matches.area_index < 0
-        gained += int(collected.sum())
-        assert (errors(room, pair, result)[collected] < 5).mean() > 0.6 or collected.sum() < 20
-    assert gained > 1000
-    assert (
-        sum((result.matches.area_index < 0).sum() for r in [results] for result in r.values() if not result.fallback)
-        < gained
-    )
+def test_gmc_adds_true_matches_where_areas_cover_little(room, results, point_matcher):
+    everywhere = match_all(room, point_matcher, changed(SGAMOptions(), collection__min_coverage=1.0))
+    never = match_all(room, point_matcher, changed(SGAMOptions(), collection__rule="none"))
+    distances = [errors(room, pair, r)[r.matches.area_index < 0] for pair, r in everywhere.items() if not r.fallback]
+    gained = np.concatenate(distances)
+    assert len(gained) > 500
+    assert (gained < 5).mean() > 0.8
+    for pair, result in never.items():
+        assert result.fallback or (result.matches.area_index >= 0).all()
+        assert len(result.matches) <= len(results[pair].matches) <= len(everywhere[pair].matches)
 
 
 def test_tracks_follow_points_of_the_room(room, results):
@@ -119,5 +115,5 @@ def test_tracks_follow_points_of_the_room(room, results):
         distance = np.linalg.norm(points1 - merged.keypoints[b][rows[:, 1]], axis=1)
         total += len(rows)
         true += int((visible & (distance < 3)).sum())
-    assert total > 5000
+    assert total > 3500
     assert true / total > 0.75

@@ -1,0 +1,206 @@
+"""The command `sgam-sfm match`, whole: real models on the rendered room, resume after SIGKILL, bad input."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import PIL.Image
+import pytest
+
+from sgam_sfm import cli
+from sgam_sfm.database import database_content
+from sgam_sfm.mapping import compare_poses
+from sgam_sfm.scene import write_ground_truth
+from tests.room import Room, write_room
+
+
+@pytest.fixture(scope="module")
+def folder(room: Room, tmp_path_factory) -> Path:
+    return write_room(room, tmp_path_factory.mktemp("room"))
+
+
+def arguments(folder: Path, output: Path, *more: str) -> list[str]:
+    return [
+        *("match", "--images", str(folder / "images"), "--pairs", str(folder / "pairs.txt")),
+        *("--cameras", str(folder / "cameras.txt"), "--labels", str(folder / "labels")),
+        *("--output", str(output), "--block-images", "2", *more),
+    ]
+
+
+@pytest.fixture(scope="module")
+def finished(folder: Path, tmp_path_factory) -> Path:
+    """The output of an undisturbed run."""
+    output = tmp_path_factory.mktemp("run") / "out"
+    assert cli.run(arguments(folder, output)) == cli.DONE
+    return output
+
+
+def summary_of(output: Path) -> dict:
+    return json.loads((output / "summary.json").read_text())
+
+
+def test_the_model_agrees_with_the_truth(room, finished, tmp_path):
+    summary = summary_of(finished)
+    assert summary["models"][0]["registered"] == len(room.images)
+    assert summary["models"][0]["points"] > 300
+    write_ground_truth(tmp_path, list(room.views.values()))
+    errors = compare_poses(finished / "sparse" / "0", tmp_path)
+    assert errors.num_images == len(room.images)
+    assert errors.median_rotation_deg < 0.3
+    assert errors.median_center < 0.03  # metres, in a room of six
+
+
+def test_the_summary_counts_what_happened(finished):
+    summary = summary_of(finished)
+    pairs = summary["pairs"]
+    assert pairs["listed"] == pairs["matched"] == 15
+    assert pairs["areas"]["object_kept"] > 20
+    assert summary["keypoints"]["raw_matches"] == pairs["raw_matches"]
+    dropped = sum(summary["keypoints"][name] for name in ("duplicates", "conflicts", "inconsistent"))
+    assert summary["keypoints"]["matches"] == pairs["raw_matches"] - dropped
+    assert {"Reading images", "Segmenting images", "Matching pairs", "Mapping"} <= set(summary["seconds"])
+    assert summary["peak_memory_mb"]["matching"] > 100
+
+
+def test_outputs_are_where_colmap_users_look_for_them(finished):
+    for name in ("database.db", "keypoints.h5", "matches.h5", "options.json", "summary.json", "log.txt"):
+        assert (finished / name).stat().st_size > 0
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (finished / "sparse" / "0" / name).exists()
+    content = database_content(finished / "database.db")
+    with h5py.File(finished / "keypoints.h5") as file:
+        for name, points in content["keypoints"].items():
+            np.testing.assert_allclose(file[name]["keypoints"][()] + 0.5, np.array(points), atol=1e-3)
+
+
+def test_started_again_it_does_nothing_anew(folder, finished):
+    before = {path: path.stat().st_mtime_ns for path in (finished / "pairs").iterdir()}
+    content = database_content(finished / "database.db")
+    assert cli.run(arguments(folder, finished)) == cli.DONE
+    assert before == {path: path.stat().st_mtime_ns for path in (finished / "pairs").iterdir()}
+    assert database_content(finished / "database.db") == content
+
+
+@pytest.mark.parametrize("moment", ["labels/labels.json", "pairs/00001.h5", "database.db"])
+def test_a_killed_run_continues_to_the_same_database(folder, finished, tmp_path, moment):
+    output = tmp_path / "out"
+    command = [sys.executable, "-m", "sgam_sfm", *arguments(folder, output)]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    while not (output / moment).exists():
+        assert process.poll() is None, "the run ended before it could be killed"
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (output / "summary.json").exists()
+    assert cli.run(arguments(folder, output)) == cli.DONE
+    assert database_content(output / "database.db") == database_content(finished / "database.db")
+
+
+def test_other_options_need_another_folder(folder, finished, capsys):
+    assert cli.run(arguments(folder, finished, "--area-size", "320")) == cli.USAGE
+    error = " ".join(capsys.readouterr().err.split())
+    assert "was begun with other --crop" in error
+    assert "choose a new --output folder" in error
+
+
+def test_options_of_a_run_are_a_config_and_flags_win_over_them(folder, finished, tmp_path):
+    config = ["--config", str(finished / "options.json"), "--output", str(tmp_path / "out"), "--no-mapping"]
+    assert cli.run(["match", *config, "--area-matcher", "none"]) == cli.DONE
+    options = json.loads((tmp_path / "out" / "options.json").read_text())
+    assert options["area_matcher"] == "none"
+    assert options["block_images"] == 2
+    assert summary_of(tmp_path / "out")["pairs"]["fallbacks"] == {"no area match": 15}
+    assert not (tmp_path / "out" / "sparse").exists()
+    assert database_content(tmp_path / "out" / "database.db")["two_view_geometries"]
+
+
+def test_bad_images_and_labels_are_counted_and_lose_nothing_else(room, folder, tmp_path):
+    spoilt = tmp_path / "room"
+    shutil.copytree(folder, spoilt)
+    names = list(room.images)
+    (spoilt / "images" / names[0]).write_bytes(b"not an image")
+    (spoilt / "labels" / f"{names[1]}.png").unlink()
+    PIL.Image.new("L", (10, 10)).save(spoilt / "labels" / f"{names[2]}.png")
+    (spoilt / "images" / "notes.txt").write_text("a file that is no image")
+    output = tmp_path / "out"
+    assert cli.run(arguments(spoilt, output, "--no-mapping")) == cli.SOME_FAILED
+    summary = summary_of(output)
+    assert list(summary["images"]["failed"]) == [names[0]]
+    assert summary["images"]["other_files"] == 1
+    assert summary["pairs"]["of_unusable_images"] == 5
+    assert summary["pairs"]["matched"] == 10
+    assert summary["pairs"]["fallbacks"]["no label map"] == 7
+    assert sorted(summary["labels"]["failed"]) == names[1:3]
+    assert "10x10" in summary["labels"]["failed"][names[2]]
+
+
+def test_masked_ground_has_no_match(room, folder, tmp_path):
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for name, image in room.images.items():
+        mask = np.full((image.height, image.width), 255, np.uint8)
+        mask[:, : image.width // 2] = 0
+        PIL.Image.fromarray(mask).save(masks / f"{name}.png")
+    output = tmp_path / "out"
+    code = cli.run(arguments(folder, output, "--no-mapping", "--mask-path", str(masks)))
+    assert code == cli.DONE
+    points = np.concatenate([np.array(p) for p in database_content(output / "database.db")["keypoints"].values() if p])
+    assert len(points) > 200
+    assert points[:, 0].min() > room.images["view00.jpg"].width // 2 - 3  # keypoints are means of several points
+
+
+ONE_LINE_ERRORS = {
+    "no folder": (["--images", "{tmp}/nowhere"], "image folder '{tmp}/nowhere' does not exist; give the folder that"),
+    "empty folder": (["--images", "{tmp}"], "image folder '{tmp}' holds no image (0 other files); expected jpg"),
+    "no pair list": (["--pairs", "{tmp}/no.txt"], "cannot read the pair list {tmp}/no.txt"),
+    "matcher": (["--matcher", "xfeat-sta"], "--matcher 'xfeat-sta' is unknown; did you mean 'xfeat-star'?"),
+    "segmenter": (["--segmenter", "cosec"], "--segmenter 'cosec' is unknown; did you mean 'coseg'?"),
+    "area matcher": (["--area-matcher", "sgma"], "--area-matcher 'sgma' is unknown; did you mean 'sgam'?"),
+    "device": (["--device", "cuda:7"], "--device 'cuda:7' cannot be used"),
+    "camera": (["--camera-params", "1,2"], "camera model SIMPLE_RADIAL has 4 parameters"),
+    "masks": (["--mask-path", "{tmp}/masks"], "--mask-path '{tmp}/masks' does not exist"),
+    "labels": (["--labels", "{tmp}/labels"], "--labels '{tmp}/labels' does not exist"),
+    "config": (["--config", "{tmp}/c.toml"], "--config '{tmp}/c.toml' cannot be used"),
+}
+
+
+@pytest.mark.parametrize("case", ONE_LINE_ERRORS)
+def test_wrong_input_is_one_line(folder, tmp_path, capsys, case):
+    changes, expected = ONE_LINE_ERRORS[case]
+    given = ["match", "--images", str(folder / "images"), "--output", str(tmp_path / "out")]
+    given += [change.format(tmp=tmp_path) for change in changes]
+    assert cli.run(given) in (cli.ERROR, cli.USAGE)
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
+    assert len(errors) == 1
+    assert expected.format(tmp=tmp_path) in errors[0]
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("view00.jpg view99.jpg", "line 1: 'view99.jpg' is not among the 6 images; the closest name is 'view0"),
+        ("view00.jpg", "line 1: expected two image names but found 1"),
+        ("view00.jpg view00.jpg", "names no pair of two different images"),
+    ],
+)
+def test_pair_lists_are_checked(folder, tmp_path, capsys, line, expected):
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text(line)
+    given = ["match", "--images", str(folder / "images"), "--output", str(tmp_path / "out"), "--pairs", str(pairs)]
+    assert cli.run(given) == cli.ERROR
+    assert expected in capsys.readouterr().err
+
+
+def test_a_missing_flag_is_a_usage_error(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.run(["match", "--images", "photos"])
+    assert ended.value.code == cli.USAGE
+    assert "--output" in capsys.readouterr().out + capsys.readouterr().err
