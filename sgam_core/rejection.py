@@ -37,7 +37,9 @@ def reject(
     """
     candidates = [area for area in areas if area.area.state is AreaState.KEPT]
     if not candidates:
-        return Verdict(areas=tuple(areas), model=None, fallback="no area match" if not areas else "no area match left after GP")
+        return Verdict(
+            areas=tuple(areas), model=None, fallback="no area match" if not areas else "no area match left after GP"
+        )
     if options.rule == "consensus":
         single = len(candidates) == 1
         whole = match_whole() if whole_is_known or single else Matches.empty()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -26,7 +25,7 @@ _DESCRIPTIONS_IN_MEMORY = 1024  # about 1 MB each
 
 def match_blocks(
     work: Sequence[Sequence[Pair]], store: PairStore, matcher: CollectionMatcher, stages: Stages
-) -> Counter[str]:
+) -> dict[str, float]:
     """Match every block that the store does not hold yet, and give the seconds that each step took.
 
     A block follows from its pairs and the options alone: the point matcher starts each one with empty caches, so that
@@ -61,7 +60,7 @@ class CollectionMatcher:
         self._area_matcher, self._point_matcher = area_matcher, point_matcher
         self._image = lru_cache(2 * options.block_images)(self._read_image)  # those of one block
         self._description = lru_cache(_DESCRIPTIONS_IN_MEMORY)(self._describe)
-        self.seconds: Counter[str] = Counter()
+        self.seconds: dict[str, float] = {}
 
     def start_block(self) -> None:
         """Empty the point matcher's caches, where it has any."""
@@ -76,7 +75,8 @@ class CollectionMatcher:
         except SGAMError as error:
             _log.warning("%s - %s: %s", *pair, error)
             return PairRecord(pair=pair, result=None, error=str(error))
-        self.seconds.update(result.seconds)
+        for step, seconds in result.seconds.items():
+            self.seconds[step] = self.seconds.get(step, 0.0) + seconds
         return PairRecord(pair=pair, result=result)
 
     def _match(self, pair: Pair) -> PairResult:

@@ -31,7 +31,7 @@ def arguments(folder: Path, output: Path, *more: str) -> list[str]:
     return [
         *("match", "--images", str(folder / "images"), "--pairs", str(folder / "pairs.txt")),
         *("--cameras", str(folder / "cameras.txt"), "--labels", str(folder / "labels")),
-        *("--output", str(output), "--block-images", "2", *more),
+        *("--output", str(output), "--block-images", "2", "--max-crop-pixels", "300000", *more),
     ]
 
 
