@@ -91,7 +91,7 @@ class MatchOptions:
     verbose: bool = False
     """Show the log on the terminal; it is always in OUT/log.txt."""
 
-    crop: Annotated[CropOptions, tyro.conf.arg(prefix_name=False)] = field(default_factory=CropOptions)
+    crop: Annotated[CropOptions, tyro.conf.arg(name="")] = field(default_factory=CropOptions)
     """Crops for the point matcher."""
     semantic: SemanticOptions = field(default_factory=SemanticOptions)
     """SAM: areas and their matching."""

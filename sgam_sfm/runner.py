@@ -109,12 +109,22 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
 
 def difference(before: dict[str, Any], now: dict[str, Any]) -> str:
     """Which options differ, for a message; the images or pairs when none does."""
+    there, here = _flags(before), _flags(now)
     changed = [
-        f"--{name.replace('_', '-')} ({before.get(name)} there, {now[name]} here)"
-        for name in now
-        if name not in NOT_IN_RESULTS | {"fingerprint"} and before.get(name) != now[name]
+        f"{flag} ({there.get(flag)} there, {value} here)" for flag, value in here.items() if there.get(flag) != value
     ]
     return ", ".join(changed) or "images or pairs"
+
+
+def _flags(options: dict[str, Any], prefix: str = "--") -> dict[str, Any]:
+    """Nested options by the flags that set them, those left out that results do not follow from."""
+    flat: dict[str, Any] = {}
+    for name, value in options.items():
+        if prefix == "--" and name in NOT_IN_RESULTS | {"fingerprint"}:
+            continue
+        flag = prefix + name.replace("_", "-")
+        flat |= _flags(value, "--" if name == "crop" else f"{flag}.") if isinstance(value, dict) else {flag: value}
+    return flat
 
 
 def stored_matches(

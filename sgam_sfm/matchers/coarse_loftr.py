@@ -13,13 +13,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import onnxruntime
 from jaxtyping import Bool, Float, Float32
 
-from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Crop, Matches
 from sgam_sfm.matchers.masks import wanted
 from sgam_sfm.matchers.subpixel import local_affines, refine
+from sgam_sfm.onnx_session import open_session
 from sgam_sfm.weights import COARSE_LOFTR, find_weights
 
 WIDTH, HEIGHT = 640, 480  # of the network's inputs
@@ -28,7 +27,6 @@ COLUMNS, ROWS = WIDTH // CELL, HEIGHT // CELL
 _CELLS = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), -1).reshape(-1, 2)  # (column, row) of every cell
 # The network's convolutions centre cell i on pixel 16 i, not on the middle of its sixteen: measured.
 _CENTERS = CELL * _CELLS + 0.5
-PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 
 
 class CoarseLoFTR:
@@ -40,7 +38,7 @@ class CoarseLoFTR:
 
     Args:
         weights: the ONNX file; looked for in the torch-hub cache when omitted.
-        device: `cpu`, or `cuda` where ONNX Runtime was installed with it.
+        device: a torch device; without a CUDA build of ONNX Runtime the CPU, with a warning.
         threads: of ONNX Runtime; 0 for its own choice.
         min_confidence: of the network, for a pair of cells.
         min_correlation: of the refined patches; -1 disables.
@@ -56,18 +54,8 @@ class CoarseLoFTR:
         min_confidence: float = 0.1,
         min_correlation: float = 0.8,
     ) -> None:
-        provider = PROVIDERS.get(device.partition(":")[0])
-        if provider not in (available := onnxruntime.get_available_providers()):
-            raise OptionError(
-                f"device '{device}' cannot be used by this ONNX Runtime ({', '.join(available)}); try 'cpu'"
-            )
         path = find_weights(COARSE_LOFTR, weights)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        try:
-            self._session = onnxruntime.InferenceSession(path, options, providers=[provider])
-        except Exception as error:  # ONNX Runtime has no common class for what can be wrong with a file
-            raise WeightsError(f"'{path}' cannot be loaded as an ONNX model ({str(error).splitlines()[0]})") from error
+        self._session = open_session(path, f"coarse-loftr ('{path}')", device, threads)
         self._inputs = [entry.name for entry in self._session.get_inputs()]
         self._confidence = self._session.get_outputs()[0].name
         self.min_confidence = min_confidence

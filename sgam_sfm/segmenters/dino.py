@@ -7,16 +7,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import onnx
-import onnxruntime
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped, unused-ignore]
 from jaxtyping import Float16, UInt8
 from onnx.utils import Extractor
 
-from sgam_core.errors import OptionError, WeightsError
+from sgam_core.errors import WeightsError
+from sgam_sfm.onnx_session import open_session
 
 PATCH = 14  # pixels a side
 _MIN_PATCHES = 4  # a side: the shorter side of a panorama, or of a tiny image, still becomes a grid
-_PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 # ImageNet's, as DINOv2 was trained.
 _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _STD = np.array([0.229, 0.224, 0.225], np.float32)
@@ -25,22 +24,14 @@ _STD = np.array([0.229, 0.224, 0.225], np.float32)
 class PatchFeatures:
     """Features of the 14-pixel patches of an image: the tokens that enter a block of the transformer.
 
-    block: counted from 0. image_size: pixels of the longer side at which the image enters the network. device: `cpu` or
-    `cuda`. threads: 0 = as many as there are cores.
+    block: counted from 0. image_size: pixels of the longer side at which the image enters the network. device, threads:
+    see `open_session`.
 
-    Raises: WeightsError when the file is not a DINOv2 in ONNX form; OptionError for a device that is not there.
+    Raises: WeightsError when the file is not a DINOv2 in ONNX form.
     """
 
     def __init__(self, weights: Path, *, block: int, image_size: int, device: str = "cpu", threads: int = 0) -> None:
-        provider = _PROVIDERS.get(device)
-        if provider not in onnxruntime.get_available_providers():
-            raise OptionError(
-                f"device '{device}' is not available to onnxruntime; use 'cpu', or install onnxruntime-gpu"
-            )
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.use_deterministic_compute = True
-        self._session = onnxruntime.InferenceSession(_cut_before(weights, block), options, providers=[provider])
+        self._session = open_session(_cut_before(weights, block), f"coseg ('{weights}')", device, threads)
         self._image_size = image_size
 
     def __call__(self, pixels: UInt8[np.ndarray, "H W 3"]) -> Float16[np.ndarray, "rows columns C"]:

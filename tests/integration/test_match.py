@@ -107,7 +107,7 @@ def test_a_killed_run_continues_to_the_same_database(folder, finished, tmp_path,
 def test_other_options_need_another_folder(folder, finished, capsys):
     assert cli.run(arguments(folder, finished, "--area-size", "320")) == cli.USAGE
     error = " ".join(capsys.readouterr().err.split())
-    assert "was begun with other --crop" in error
+    assert "was begun with other --area-size (640 there, 320 here)" in error
     assert "choose a new --output folder" in error
 
 
