@@ -11,12 +11,18 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.spatial import cKDTree
 
-RADIUS = 8  # samples from the centre of a patch to its side
-STRIDES = (4, 2, 1)  # pixels between samples, coarse to fine
-ITERATIONS = 6  # per stride
+RADIUS = 7  # samples from the centre of a patch to its side
+SIDE = 2 * RADIUS + 1
+ITERATIONS = 4  # per stride
+MIN_CONTRAST = 1.0  # standard deviation of a patch in gray levels, below which there is nothing to align
 MIN_NEIGHBOURS = 4  # for an affine map, which has three unknowns a row
 OUTLYING = 0.1  # this far off the local map (in radii of the neighbourhood) a neighbour loses half its say
 PRIOR = 1e-3  # towards the identity, for neighbours on a line
+
+_span = np.arange(-RADIUS, RADIUS + 1, dtype=np.float32)
+_GRID = np.stack(np.meshgrid(_span, _span), -1).reshape(-1, 2)
+_WINDOW = np.exp(-(_GRID**2).sum(1) / RADIUS**2)
+_WINDOW /= _WINDOW.sum()
 
 
 def local_affines(
@@ -53,37 +59,36 @@ def refine(
     points0: Float[np.ndarray, "M 2"],
     points1: Float[np.ndarray, "M 2"],
     affines: Float[np.ndarray, "M 2 2"],
+    *,
+    strides: tuple[int, ...] = (4, 2, 1),
 ) -> tuple[Float[np.ndarray, "M 2"], Float[np.ndarray, " M"]]:
     """Move points1 to where image 1 looks most like image 0 around points0, whatever the brightness and contrast.
 
-    Args: gray0, gray1 intensities; points in pixels, corner origin; affines: the linear maps from image 0 to image 1.
+    Args: gray0, gray1 intensities; points in pixels, corner origin; affines: the linear maps from image 0 to image 1;
+        strides: pixels between the samples of a patch, coarse to fine. A stride reaches about three times as far.
     Returns: the new points1, and the correlation of each pair of patches in [-1, 1], 0 where there is no texture.
     Source: inverse compositional alignment (Baker & Matthews, IJCV 2004) of a translation, the affine part held.
     """
     correlation = np.zeros(len(points0))
     if len(points0) == 0:
         return points1, correlation
-    span = np.arange(-RADIUS, RADIUS + 1, dtype=np.float64)
-    grid = np.stack(np.meshgrid(span, span), -1).reshape(-1, 2)
-    window = np.exp(-(grid**2).sum(1) / RADIUS**2)
-    window /= window.sum()
-    for stride in STRIDES:
+    for stride in strides:
         smooth0, smooth1 = _smoothed(gray0, stride), _smoothed(gray1, stride)
-        template, contrast = _standardised(_sample(smooth0, points0[:, None] + stride * grid), window)
-        slopes = np.stack(np.gradient(template.reshape(-1, len(span), len(span)), stride, axis=(2, 1)), -1)
-        slopes = slopes.reshape(len(points0), -1, 2)
-        steepest = (slopes * window[:, None]).swapaxes(1, 2)
-        hessians = steepest @ slopes
+        template, contrast0 = _patches(smooth0, points0, stride * _GRID)
+        slopes = np.gradient(template.reshape(-1, SIDE, SIDE), stride, axis=(2, 1))
+        slope_x, slope_y = (slope.reshape(len(points0), -1) for slope in slopes)
+        weighted = np.stack([slope_x * _WINDOW, slope_y * _WINDOW], 1)
+        hessians = np.stack([weighted @ slope[..., None] for slope in (slope_x, slope_y)], 2)[..., 0].astype(np.float64)
         hessians += (1e-3 * np.trace(hessians, axis1=1, axis2=2)[:, None, None] + 1e-9) * np.eye(2)
-        surroundings1 = stride * grid @ affines.swapaxes(1, 2)
+        offsets1 = (stride * _GRID @ affines.swapaxes(1, 2)).astype(np.float32)
         for _ in range(ITERATIONS):
-            patches, _ = _standardised(_sample(smooth1, points1[:, None] + surroundings1), window)
-            steps = np.linalg.solve(hessians, steepest @ (patches - template)[..., None])
+            patches, _ = _patches(smooth1, points1, offsets1)
+            steps = np.linalg.solve(hessians, weighted @ (patches - template)[..., None])
             steps *= np.minimum(1, stride / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9))
             points1 = points1 - (affines @ steps)[..., 0]
-    patches, contrast1 = _standardised(_sample(smooth1, points1[:, None] + surroundings1), window)
-    textured = (contrast > 1) & (contrast1 > 1)
-    correlation[textured] = ((template * patches) @ window)[textured]
+    patches, contrast1 = _patches(smooth1, points1, offsets1)
+    textured = np.minimum(contrast0, contrast1) > MIN_CONTRAST
+    correlation[textured] = ((template * patches) @ _WINDOW)[textured]
     return points1, correlation.clip(-1, 1)
 
 
@@ -91,13 +96,15 @@ def _smoothed(gray: np.ndarray, stride: int) -> np.ndarray:
     return gray if stride == 1 else cv2.GaussianBlur(gray, (0, 0), stride / 2)
 
 
-def _sample(gray: np.ndarray, points: np.ndarray) -> np.ndarray:
-    x, y = np.moveaxis(points.astype(np.float32) - np.float32(0.5), -1, 0)  # OpenCV's first pixel is centred on 0
-    return cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+def _patches(gray: np.ndarray, points: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Intensities (M, P) at `offsets` around each point, with mean 0 and deviation 1 under the window.
 
-
-def _standardised(patches: np.ndarray, window: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Patches (M, P) with mean 0 and deviation 1 under the window, and what their deviation was (M,)."""
-    centred = patches - (patches @ window)[:, None]
-    deviation = np.sqrt(centred**2 @ window)
-    return centred / np.maximum(deviation, 1e-6)[:, None], deviation
+    Also returns what their deviation was (M,).
+    """
+    x, y = (points - 0.5).astype(np.float32).T  # OpenCV's first pixel is centred on 0
+    patches = cv2.remap(
+        gray, x[:, None] + offsets[..., 0], y[:, None] + offsets[..., 1], cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE
+    )
+    patches -= (patches @ _WINDOW)[:, None]
+    deviation = np.sqrt(patches**2 @ _WINDOW)
+    return patches / np.maximum(deviation, 1e-6)[:, None], deviation

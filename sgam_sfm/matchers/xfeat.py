@@ -1,22 +1,24 @@
 """XFeat*: semi-dense matching of learned features at two scales, on kornia's model (Potje et al., CVPR 2024).
 
-Follows the paper's semi-dense mode with four differences, each measured:
+Follows the paper's semi-dense mode with five differences, each measured:
 - every crop is resized once per scale (not twice), so that a cell of the network is an exact affine map of crop pixels;
 - descriptors are normalised before they are compared;
 - the offset inside a cell is calibrated and applied to both sides. The network predicts where the reference point of
   the other image's cell lies in this image's cell, and its softmax expectation falls short of the true offset by a
   sixth. Asked both ways it gives two correspondences of one cell pair; their midpoint is again a correspondence of a
   locally affine map, with less noise, no bias, and no preference for one of the images;
-- fewer of the features come from the coarse scale, whose cells cover 13 pixels.
+- fewer of the features come from the coarse scale, whose cells cover 13 pixels;
+- where the patches of a match look alike, they decide the last half pixel.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -28,6 +30,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Crop, Matches
 from sgam_sfm.matchers.masks import wanted
+from sgam_sfm.matchers.subpixel import local_affines, refine
 from sgam_sfm.weights import XFEAT, find_weights
 
 CELL = 8  # pixels of the network's input per cell
@@ -35,12 +38,16 @@ MULTIPLE = 32  # the input's width and height are multiples of this
 SOFTMAX_TEMPERATURE = 3.0  # of the 8 x 8 offset logits, as published
 OFFSET_GAIN = 1.2  # true offset over expected offset: regressed on warps with exact ground truth
 MIN_FEATURES = 64  # of a crop, however small
+MIN_CORRELATION = 0.6  # of two patches that may move a match
+MAX_SHIFT = 2.0  # crop pixels; a larger one has slid along an edge
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Features:
-    """The features of one crop: raw descriptors (K, 64), centres of their cells and the size of a network pixel
-    (K, 2), both in crop pixels."""
+    """The features of one crop, in crop pixels.
+
+    descriptors: (K, 64), not normalised. centers: (K, 2), of their cells. steps: (K, 2), size of a network pixel.
+    """
 
     descriptors: Tensor
     centers: Tensor
@@ -48,7 +55,7 @@ class _Features:
 
     @property
     def nbytes(self) -> int:
-        return sum(t.nbytes for t in (self.descriptors, self.centers, self.steps))
+        return self.descriptors.nbytes + self.centers.nbytes + self.steps.nbytes
 
     def select(self, rows: Tensor) -> _Features:
         return _Features(self.descriptors[rows], self.centers[rows], self.steps[rows])
@@ -57,9 +64,10 @@ class _Features:
 class XFeatStar:
     """Point matcher (`sgam_core.protocols.PointMatcher`): XFeat, semi-dense.
 
-    Features of a crop are extracted once and kept, least recently used dropped first, until `reset()`. Crops go
-    through the network one by one, so that no result depends on what else was asked for or is cached. Equal input
-    gives equal output; `seed` is accepted as by every matcher, but nothing here is random.
+    Features of a crop are extracted once and kept, least recently used dropped first, until `reset()`. Crops of equal
+    size go through the network in batches; on the CPU one by one, which is as fast and keeps results independent of
+    what else is asked for or cached. Equal input after a `reset()` gives equal output; `seed` is accepted as by every
+    matcher, but nothing here is random.
 
     The score of a match is cos^4 * sqrt(c0 * c1): the cosine of its descriptors, and the confidences of the two
     offsets. It ranks inliers better than any of the three alone.
@@ -72,6 +80,8 @@ class XFeatStar:
         coarse_share: share of the features that comes from the first scale; 0 for the second scale alone.
         min_confidence: both offset confidences of a match exceed it; 0 disables.
         min_cosine: the descriptors' cosine exceeds it; -1 disables.
+        photometric: align the patches of the matches in the end, on the CPU.
+        batch_size: crops that go through the network together; 0: 1 on the CPU, 8 elsewhere.
         cache_bytes: bound of the kept features.
 
     Attributes:
@@ -89,6 +99,8 @@ class XFeatStar:
         coarse_share: float = 0.1,
         min_confidence: float = 0.25,
         min_cosine: float = 0.8,
+        photometric: bool = True,
+        batch_size: int = 0,
         cache_bytes: int = 512 * 2**20,
     ) -> None:
         if not 0 <= coarse_share < 1:
@@ -102,6 +114,8 @@ class XFeatStar:
         self.shares = ((scales[0], coarse_share), (scales[1], 1 - coarse_share))
         self.min_confidence = min_confidence
         self.min_cosine = min_cosine
+        self.photometric = photometric
+        self.batch_size = batch_size or (1 if self.device.type == "cpu" else 8)
         self.cache_bytes = cache_bytes
         self.pixels_extracted = 0
         self._cache: OrderedDict[tuple, _Features] = OrderedDict()
@@ -114,6 +128,7 @@ class XFeatStar:
     @torch.inference_mode()
     def match(self, pairs: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
         """Match every pair of crops; see `PointMatcher.match`."""
+        self._extract_all([crop for pair in pairs for crop in pair])
         return [self._match(crop0, crop1) for crop0, crop1 in pairs]
 
     def _match(self, crop0: Crop, crop1: Crop) -> Matches:
@@ -130,42 +145,65 @@ class XFeatStar:
         scores = (cosines[sure] ** 4 * torch.sqrt(confidences0[sure] * confidences1)).clamp(0, 1).cpu().numpy()
 
         good = (confidences1 > self.min_confidence).cpu().numpy() & wanted(crop0, points0) & wanted(crop1, points1)
-        return Matches(points0=points0[good], points1=points1[good], scores=scores[good])
+        matches = Matches(points0=points0[good], points1=points1[good], scores=scores[good])
+        return _aligned(crop0, crop1, matches) if self.photometric else matches
 
     def _features(self, crop: Crop) -> _Features:
-        if (features := self._cache.pop(crop.key, None)) is None:
-            features = self._extract(crop)
+        if crop.key not in self._cache:  # dropped since, or larger than the cache
+            self._keep(crop, self._extract([crop])[0])
+        self._cache.move_to_end(crop.key)
+        return self._cache[crop.key]
+
+    def _keep(self, crop: Crop, features: _Features) -> None:
         self._cache[crop.key] = features
         while sum(f.nbytes for f in self._cache.values()) > self.cache_bytes and len(self._cache) > 1:
             self._cache.popitem(last=False)
-        return features
 
-    def _extract(self, crop: Crop) -> _Features:
-        width, height = crop.size
-        self.pixels_extracted += width * height
-        gray = torch.from_numpy(crop.pixels()).to(self.device).float().mean(-1)
+    def _extract_all(self, crops: Sequence[Crop]) -> None:
+        """Extract the crops that are not kept yet, in batches of equal size."""
+        by_size: dict[tuple[int, int], dict[tuple, Crop]] = {}
+        for crop in crops:
+            if crop.key not in self._cache:
+                by_size.setdefault(crop.size, {})[crop.key] = crop
+        for same_size in by_size.values():
+            missing = list(same_size.values())
+            for start in range(0, len(missing), self.batch_size):
+                batch = missing[start : start + self.batch_size]
+                for crop, features in zip(batch, self._extract(batch), strict=True):
+                    self._keep(crop, features)
+
+    def _extract(self, crops: Sequence[Crop]) -> list[_Features]:
+        """The features of crops of one size, which go through the network together."""
+        width, height = crops[0].size
+        self.pixels_extracted += len(crops) * width * height
+        gray = torch.stack([torch.from_numpy(crop.pixels()).to(self.device).float().mean(-1) for crop in crops])
         budget = max(MIN_FEATURES, round(self.features_per_megapixel * width * height / 1e6))
-        parts = [
-            self._extract_at(scale, round(share * budget), gray, crop) for scale, share in self.shares if share > 0
+        scales = [self._extract_at(scale, round(share * budget), gray, crops) for scale, share in self.shares if share]
+        return [
+            _Features(*(torch.cat([getattr(part, name) for part in parts]) for name in _Features.__slots__))
+            for parts in zip(*scales, strict=True)
         ]
-        return _Features(*(torch.cat([getattr(part, name) for part in parts]) for name in _Features.__slots__))
 
-    def _extract_at(self, scale: float, count: int, gray: Tensor, crop: Crop) -> _Features:
-        """The `count` most reliable cells of the crop, seen at `scale` of its size."""
-        width, height = (max(MULTIPLE, round(scale * side / MULTIPLE) * MULTIPLE) for side in crop.size)
-        image = interpolate(gray[None, None], (height, width), mode="bilinear", align_corners=False)
+    def _extract_at(self, scale: float, count: int, gray: Tensor, crops: Sequence[Crop]) -> list[_Features]:
+        """The `count` most reliable cells of each crop, seen at `scale` of its size."""
+        size = crops[0].size
+        width, height = (max(MULTIPLE, round(scale * side / MULTIPLE) * MULTIPLE) for side in size)
+        images = interpolate(gray[:, None], (height, width), mode="bilinear", align_corners=False)
         with torch.autocast(self.device.type, torch.float16, enabled=self.device.type == "cuda"):
-            maps, _, reliability = self._net(image.contiguous(memory_format=torch.channels_last))
+            maps, _, reliability = self._net(images.contiguous(memory_format=torch.channels_last))
 
         cells_y, cells_x = torch.meshgrid(*(torch.arange(n, device=self.device) for n in maps.shape[2:]), indexing="ij")
-        step = torch.tensor([crop.size[0] / width, crop.size[1] / height], dtype=torch.float64, device=self.device)
+        step = torch.tensor([size[0] / width, size[1] / height], dtype=torch.float64, device=self.device)
         centers = (CELL * torch.stack([cells_x, cells_y], -1).reshape(-1, 2) + CELL / 2) * step
-        best = reliability.float().flatten().argsort(descending=True, stable=True)
-        if crop.image.mask is not None:
-            best = best[torch.from_numpy(wanted(crop, centers.cpu().numpy())).to(self.device)[best]]
-        best = best[:count]
-        descriptors = maps.float()[0].flatten(1).T[best].contiguous()
-        return _Features(descriptors, centers[best], step.expand(len(best), 2))
+        found = []
+        for crop, own_map, own_reliability in zip(crops, maps.float(), reliability.float(), strict=True):
+            best = own_reliability.flatten().argsort(descending=True, stable=True)
+            if crop.image.mask is not None:
+                best = best[torch.from_numpy(wanted(crop, centers.cpu().numpy())).to(self.device)[best]]
+            best = best[:count]
+            descriptors = own_map.flatten(1).T[best].contiguous()
+            found.append(_Features(descriptors, centers[best], step.expand(len(best), 2)))
+        return found
 
     def _offsets(self, here: _Features, there: _Features) -> tuple[Tensor, Tensor]:
         """Where the cell centres `there` lie `here`: (M, 2) crop pixels from the centre, and (M,) confidences."""
@@ -223,6 +261,16 @@ def _mutual_nearest(
 def _first_of_each(values: Tensor) -> Tensor:
     _, first = np.unique(values.cpu().numpy(), return_index=True)
     return torch.from_numpy(np.sort(first)).to(values.device)
+
+
+def _aligned(crop0: Crop, crop1: Crop, matches: Matches) -> Matches:
+    """The matches with their second points moved to where the patches agree; where they do not, as they were."""
+    gray0, gray1 = (cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY).astype(np.float32) for crop in (crop0, crop1))
+    affines = local_affines(matches.points0, matches.points1)
+    points1, correlations = refine(gray0, gray1, matches.points0, matches.points1, affines, strides=(1,))
+    near = np.linalg.norm(points1 - matches.points1, axis=1) < MAX_SHIFT
+    better = near & (correlations > MIN_CORRELATION) & wanted(crop1, points1)
+    return replace(matches, points1=np.where(better[:, None], points1, matches.points1))
 
 
 def _device(name: str) -> torch.device:

@@ -34,7 +34,7 @@ options = st.builds(
     cluster_radius_px=st.sampled_from([0.1, 0.33, 2.0]),
     track_radius_px=st.sampled_from([0.0, 2.0, 6.0]),
     min_shared_images=st.integers(0, 3),
-    max_residual_sigmas=st.sampled_from([0.0, 1.5]),
+    max_residual_sigmas=st.sampled_from([0.0, 1.0]),
 )
 
 
