@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from importlib.metadata import version
+from importlib.metadata import distributions, version
 from typing import Any
 
 from rich.console import Console
@@ -83,7 +83,8 @@ def summarise_keypoints(merged: CollectionKeypoints) -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Versions of the packages that results depend on."""
-    return {package: version(package) for package in _PACKAGES}
+    installed = {distribution.name for distribution in distributions()}
+    return {package: version(package) for package in _PACKAGES if package in installed}
 
 
 def print_summary(summary: Mapping[str, Any], console: Console) -> None:
@@ -91,7 +92,15 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     images, pairs, models = summary["images"], summary["pairs"], summary["models"]
     table = Table(show_header=False, box=None)
     table.add_row("images", f"{images['used']} used, {len(images['failed'])} failed")
-    table.add_row("pairs", f"{pairs['matched']} matched, {len(pairs['failed'])} failed, {pairs['verified']} verified")
+    dropped = sum(pairs[reason] for reason in ("repeated", "reversed", "self"))
+    table.add_row(
+        "pairs",
+        f"{pairs['matched']} matched, {len(pairs['failed']) + pairs['of_unusable_images']} failed, "
+        f"{pairs['verified']} verified" + (f"; {dropped} repeated or reversed lines dropped" if dropped else ""),
+    )
+    if summary["labels"].get("num_labels_chosen"):
+        stability = summary["labels"]["stability"][str(summary["labels"]["num_labels_chosen"])]
+        table.add_row("labels", f"{summary['labels']['num_labels_chosen']}, runs agree by {stability:.2f}")
     kept = sum(count for name, count in pairs["areas"].items() if name.endswith("_kept"))
     if pairs["areas"]:
         gain = pairs["mean_resolution_gain"]

@@ -69,8 +69,8 @@ class XFeatStar:
     what else is asked for or cached. Equal input after a `reset()` gives equal output; `seed` is accepted as by every
     matcher, but nothing here is random.
 
-    The score of a match is cos^4 * sqrt(c0 * c1): the cosine of its descriptors, and the confidences of the two
-    offsets. It ranks inliers better than any of the three alone.
+    The score of a match is cos^4 * sqrt(c0 * c1) * (1 + r) / 2: the cosine of its descriptors, the confidences of the
+    two offsets, and the correlation of its patches. It ranks inliers better than any of them alone.
 
     Args:
         weights: the model file; found by itself when omitted.
@@ -264,13 +264,20 @@ def _first_of_each(values: Tensor) -> Tensor:
 
 
 def _aligned(crop0: Crop, crop1: Crop, matches: Matches) -> Matches:
-    """The matches with their second points moved to where the patches agree; where they do not, as they were."""
+    """The matches with their second points moved to where the patches agree; where they do not, as they were.
+
+    The scores fall by the share of the patches that does not correlate.
+    """
     gray0, gray1 = (cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY).astype(np.float32) for crop in (crop0, crop1))
     affines = local_affines(matches.points0, matches.points1)
     points1, correlations = refine(gray0, gray1, matches.points0, matches.points1, affines, strides=(1,))
     near = np.linalg.norm(points1 - matches.points1, axis=1) < MAX_SHIFT
     better = near & (correlations > MIN_CORRELATION) & wanted(crop1, points1)
-    return replace(matches, points1=np.where(better[:, None], points1, matches.points1))
+    return replace(
+        matches,
+        points1=np.where(better[:, None], points1, matches.points1),
+        scores=matches.scores * (1 + correlations) / 2,
+    )
 
 
 def _device(name: str) -> torch.device:

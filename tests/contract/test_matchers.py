@@ -1,0 +1,143 @@
+"""What every registered point matcher must do, whatever it is made of."""
+
+import os
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sgam_core.errors import WeightsError
+from sgam_core.types import Box, Crop, Matches
+from sgam_sfm.registry import available, create
+from tests.textures import similarity, transfer, view, whole
+
+WEIGHTS = Path(os.environ.get("SGAM_SFM_WEIGHTS", Path(__file__).parents[2] / "../shared/weights"))
+FILES = {"coarse-loftr": "coarse_loftr_teacher.onnx"}  # those that no installed package carries
+SIZE = (320, 240)
+WARP = similarity(1.1, 6, (7.3, -4.6), (160, 120))
+
+
+@cache
+def _made(name: str):
+    file = WEIGHTS / FILES[name] if name in FILES else None
+    return create("matcher", name, weights=file if file is not None and file.is_file() else None)
+
+
+@pytest.fixture(params=list(available("matcher")))
+def matcher(request):
+    try:
+        made = _made(request.param)
+    except WeightsError as error:
+        pytest.skip(f"{request.param}: {error}; or set SGAM_SFM_WEIGHTS to the folder of {FILES.get(request.param)}")
+    if hasattr(made, "reset"):
+        made.reset()
+    return made
+
+
+@cache
+def _pixels(which: int) -> np.ndarray:
+    return view(np.eye(3) if which == 0 else WARP, SIZE)
+
+
+@pytest.fixture
+def pair() -> tuple[Crop, Crop]:
+    """A textured image and the same through `WARP`."""
+    return whole(_pixels(0), "first"), whole(_pixels(1), "second")
+
+
+def check(matches: Matches, crop0: Crop, crop1: Crop) -> None:
+    for points, crop in ((matches.points0, crop0), (matches.points1, crop1)):
+        assert points.dtype == np.float64
+        assert points.shape == (len(matches), 2)
+        assert np.isfinite(points).all()
+        assert ((points >= 0) & (points < crop.size)).all()
+    assert matches.scores.dtype == np.float32
+    assert ((matches.scores >= 0) & (matches.scores <= 1)).all()
+
+
+def assert_equal(a: Matches, b: Matches) -> None:
+    for name in ("points0", "points1", "scores"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def errors(matches: Matches) -> np.ndarray:
+    return np.linalg.norm(transfer(WARP, matches.points0) - matches.points1, axis=1)
+
+
+def test_known_warp_is_recovered_below_a_pixel(matcher, pair):
+    (matches,) = matcher.match([pair])
+    check(matches, *pair)
+    assert len(matches) > 40
+    assert np.median(errors(matches)) < 0.5
+    assert (errors(matches) < 3).mean() > 0.9
+
+
+def test_nothing_asked_nothing_returned(matcher):
+    assert matcher.match([]) == []
+
+
+@pytest.mark.parametrize("level", [0, 128])
+def test_blank_images(matcher, pair, level):
+    blank = whole(np.full((240, 320, 3), level, np.uint8), "blank")
+    other = whole(np.full((100, 200, 3), level, np.uint8), "other")
+    for crops in ((blank, blank), (blank, other), (pair[0], blank)):
+        check(matcher.match([crops])[0], *crops)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (8, 8), (33, 17), (17, 33), (5, 300)])
+def test_tiny_crops(matcher, pair, size):
+    window = Box(x0=40, y0=40, x1=40 + min(size[0], 200), y1=40 + min(size[1], 180))
+    tiny = Crop(image=pair[0].image, window=window, size=size)
+    for crops in ((tiny, tiny), (tiny, pair[1]), (pair[1], tiny)):
+        check(matcher.match([crops])[0], *crops)
+
+
+def test_points_are_in_the_pixels_of_a_crop_not_of_its_image(matcher, pair):
+    first = Crop(image=pair[0].image, window=Box(x0=40, y0=30, x1=280, y1=210), size=(240, 180))
+    second = Crop(image=pair[1].image, window=Box(x0=10, y0=20, x1=310, y1=230), size=(300, 210))
+    (matches,) = matcher.match([(first, second)])
+    check(matches, first, second)
+    mapped = transfer(WARP, first.to_image(matches.points0)) - second.to_image(matches.points1)
+    assert len(matches) > 20
+    assert np.median(np.linalg.norm(mapped, axis=1)) < 0.5
+
+
+def test_no_match_under_a_mask(matcher, pair):
+    rng = np.random.default_rng(5)
+    masks = [np.kron(rng.random((6, 8)) < 0.7, np.ones((40, 40))).astype(bool) for _ in pair]
+    masked = tuple(whole(crop.image.pixels, f"masked {i}", masks[i]) for i, crop in enumerate(pair))
+    (matches,) = matcher.match([masked])
+    assert len(matches) > 20
+    for points, mask in ((matches.points0, masks[0]), (matches.points1, masks[1])):
+        x, y = points.astype(int).T
+        assert mask[y, x].all()
+    nothing = whole(pair[0].image.pixels, "hidden", np.zeros(SIZE[::-1], bool))
+    assert [len(m) for m in matcher.match([(nothing, pair[1]), (pair[1], nothing)])] == [0, 0]
+
+
+def test_equal_input_gives_equal_bits(matcher, pair):
+    (first,) = matcher.match([pair])
+    (again,) = matcher.match([pair])
+    assert_equal(first, again)
+    if hasattr(matcher, "reset"):
+        matcher.reset()
+    (renewed,) = matcher.match([pair])
+    assert_equal(first, renewed)
+
+
+def test_a_list_is_matched_as_its_pairs_are_and_in_their_order(matcher, pair):
+    blank = whole(np.full((100, 200, 3), 90, np.uint8), "blank")
+    part = Crop(image=pair[0].image, window=Box(x0=60, y0=40, x1=260, y1=200), size=(200, 160))
+    pairs = [(pair[0], pair[1]), (part, pair[1]), (blank, pair[0]), (pair[0], part)]
+    together = matcher.match(pairs)
+    assert len({len(matches) for matches in together}) == len(pairs)  # so that a wrong order would show
+    for crops, matches in zip(pairs, together, strict=True):
+        assert_equal(matches, matcher.match([crops])[0])
+
+
+def test_swapping_the_images_finds_the_same_warp(matcher, pair):
+    (there,) = matcher.match([pair])
+    (back,) = matcher.match([pair[::-1]])
+    assert np.median(errors(back.swapped())) < 0.5
+    assert 0.5 < len(there) / len(back) < 2

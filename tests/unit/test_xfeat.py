@@ -1,0 +1,139 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sgam_core.errors import OptionError, WeightsError
+from sgam_core.types import Box, Crop
+from sgam_sfm.matchers.xfeat import XFeatStar, _mutual_nearest
+from tests.textures import similarity, transfer, view, whole
+
+
+@pytest.fixture(scope="module")
+def matcher():
+    return XFeatStar(photometric=False)
+
+
+@pytest.fixture(scope="module")
+def crop():
+    return whole(view(np.eye(3), (160, 128)), "texture")
+
+
+def median_error(matcher: XFeatStar, size: tuple[int, int], scale: float) -> np.ndarray:
+    """Median signed error (2,) over shifts that sample the phases of the 8-pixel cells, and both turns."""
+    matcher.reset()
+    first = whole(view(np.eye(3), size), "first")
+    errors = []
+    for i, (degrees, shift) in enumerate([(4, (2.2, 5.9)), (-4, (5.1, -2.3)), (4, (-3.4, -6.8)), (-4, (-6.7, 3.6))]):
+        warp = similarity(scale, degrees, shift, (size[0] / 2, size[1] / 2))
+        (matches,) = matcher.match([(first, whole(view(warp, size), f"warped {i}"))])
+        errors.append(transfer(warp, matches.points0) - matches.points1)
+    return np.median(np.concatenate(errors), axis=0)
+
+
+@pytest.mark.parametrize(
+    ("size", "scale"), [((333, 251), 1.0), ((251, 317), 1.0), ((333, 251), 1.2), ((317, 245), 0.8)]
+)
+@pytest.mark.parametrize("photometric", [False, True])
+def test_coordinates_are_unbiased_at_odd_sizes_and_changes_of_scale(matcher, monkeypatch, size, scale, photometric):
+    monkeypatch.setattr(matcher, "photometric", photometric)
+    assert np.abs(median_error(matcher, size, scale)).max() < 0.05
+
+
+def test_alignment_makes_matches_three_times_as_precise(matcher, monkeypatch):
+    size, warp = (320, 240), similarity(1.1, 6, (3.3, -4.6), (160, 120))
+    pair = whole(view(np.eye(3), size), "first"), whole(view(warp, size), "second")
+    spread = {}
+    for photometric in (False, True):
+        monkeypatch.setattr(matcher, "photometric", photometric)
+        (matches,) = matcher.match([pair])
+        spread[photometric] = np.median(np.linalg.norm(transfer(warp, matches.points0) - matches.points1, axis=1))
+    assert spread[True] < spread[False] / 3
+    assert spread[True] < 0.15
+
+
+def test_a_crop_is_extracted_once_until_reset(matcher, crop):
+    matcher.reset()
+    before = matcher.pixels_extracted
+    matcher.match([(crop, crop), (crop, crop)])
+    assert matcher.pixels_extracted - before == 160 * 128
+    matcher.reset()
+    matcher.match([(crop, crop)])
+    assert matcher.pixels_extracted - before == 2 * 160 * 128
+
+
+def test_the_cache_is_bounded_and_drops_the_least_recently_used(crop):
+    windows = [Box(x0=x, y0=0, x1=x + 96, y1=96) for x in (0, 16, 32)]
+    first, second, third = (Crop(image=crop.image, window=window, size=(96, 96)) for window in windows)
+    matcher = XFeatStar()
+    matcher.match([(first, second)])
+    matcher.cache_bytes = sum(features.nbytes for features in matcher._cache.values())
+    matcher.match([(first, third)])
+    assert list(matcher._cache) == [first.key, third.key]
+
+
+def test_features_under_a_mask_are_not_extracted(matcher, crop):
+    mask = np.zeros((128, 160), bool)
+    mask[:, :80] = True
+    features = matcher._extract(whole(crop.image.pixels, "masked", mask))
+    assert len(features.centers) > 0
+    assert (features.centers[:, 0] < 80).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 60), st.integers(0, 60), st.integers(0, 2**32 - 1), st.booleans())
+def test_mutual_nearest_agrees_with_the_full_matrix(count0, count1, seed, repeated):
+    rng = np.random.default_rng(seed)
+    unit0, unit1 = (rng.normal(size=(count, 8)).astype(np.float32) for count in (count0, count1))
+    if repeated and count1 > 1:
+        unit1[1] = unit1[0]
+    rows0, rows1, cosines = _mutual_nearest(torch.from_numpy(unit0), torch.from_numpy(unit1), 0.2)
+    unit0, unit1 = (unit / np.linalg.norm(unit, axis=1, keepdims=True) for unit in (unit0, unit1))
+    full = unit0 @ unit1.T
+    for row0, row1, cosine in zip(rows0.tolist(), rows1.tolist(), cosines.tolist(), strict=True):
+        assert full[row0].max() == pytest.approx(full[row0, row1], abs=1e-6)
+        assert full[:, row1].max() == pytest.approx(full[row0, row1], abs=1e-6)
+        assert cosine == pytest.approx(full[row0, row1], abs=1e-6)
+    assert len(set(rows0.tolist())) == len(set(rows1.tolist())) == len(rows0)
+    mutual = (full == full.max(1, keepdims=True)) & (full == full.max(0)) & (full > 0.2) if full.size else full
+    assert repeated or len(rows0) == mutual.sum()
+
+
+def test_mutual_nearest_is_the_same_in_one_block_or_in_many(monkeypatch):
+    unit0, unit1 = torch.randn(2, 3000, 64, generator=torch.Generator().manual_seed(0))
+    rows0, rows1, _ = _mutual_nearest(unit0, unit1, -1)  # 9 blocks
+    similarity = torch.nn.functional.normalize(unit0, dim=1) @ torch.nn.functional.normalize(unit1, dim=1).T
+    expected = torch.nonzero(similarity.argmax(0)[similarity.argmax(1)] == torch.arange(3000))[:, 0]
+    assert rows0.tolist() == expected.tolist()
+    assert rows1.tolist() == similarity.argmax(1)[expected].tolist()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"coarse_share": 1.0}, "coarse_share is 1.0; expected at least 0 and less than 1"),
+        ({"features_per_megapixel": 0}, "features_per_megapixel is 0; expected at least 1"),
+        ({"scales": (0.0, 1.3)}, "scales are (0.0, 1.3); expected two positive factors"),
+    ],
+)
+def test_wrong_settings_are_named(settings, message):
+    with pytest.raises(OptionError) as error:
+        XFeatStar(**settings)
+    assert str(error.value) == message
+
+
+@pytest.mark.parametrize("device", ["toaster", "cuda:99"])
+def test_a_device_that_is_not_there(device):
+    with pytest.raises(OptionError, match=f"^device '{device}' cannot be used .*; try 'cpu', or 'cuda' with a GPU$"):
+        XFeatStar(device=device)
+
+
+def test_a_file_that_is_no_xfeat_model(tmp_path):
+    torch.save({"other.weight": torch.zeros(3)}, tmp_path / "other.pt")
+    (tmp_path / "text.pt").write_text("not a model")
+    for name in ("other.pt", "text.pt"):
+        with pytest.raises(WeightsError) as error:
+            XFeatStar(weights=tmp_path / name)
+        assert str(error.value).startswith(f"'{tmp_path / name}' cannot be loaded as XFeat weights (")
+        assert "\n" not in str(error.value)
