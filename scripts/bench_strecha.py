@@ -14,6 +14,8 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import subprocess
+import sys
 import zlib  # noqa: F401  (before pycolmap, whose wheel carries a zlib of its own)
 from itertools import combinations
 from pathlib import Path
@@ -46,7 +48,8 @@ def run(scene: Path, output: Path, method: str, options: list[str]) -> dict:
     params = ",".join(str(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     camera = ["--camera-model", "PINHOLE", "--camera-params", params, "--camera-mode", "single"]
     files = ["--images", str(scene / "images"), "--output", str(output)]
-    code = cli.run(["match", *files, "--area-matcher", method, *camera, *options])
+    command = [sys.executable, "-m", "sgam_sfm", "match", *files, "--area-matcher", method, *camera, *options]
+    code = subprocess.run(command, check=False).returncode  # a process of its own, for its peak memory
     summary = json.loads((output / "summary.json").read_text())
     model = summary["models"][0] if code == cli.DONE else {}
     errors = pose_errors(output / "sparse" / "0", scene) if model else np.full(1, 180.0)
