@@ -73,6 +73,8 @@ def match_described(
     putative = area_matcher.match(description0, description1, points.whole)
     clock.lap("area matching")
     confident, doubtful = points.inside(putative, options.prediction.max_candidates)
+    if options.collection.min_coverage >= 1:
+        points.whole()  # GMC asks for them in any case, and GR judges better with them
     clock.lap("crops")
     areas = [*confident, *predict(confident, doubtful, estimate, options.geometry, options.prediction)]
     clock.lap("GP")

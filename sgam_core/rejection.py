@@ -40,9 +40,10 @@ def reject(
         return Verdict(
             areas=tuple(areas), model=None, fallback="no area match" if not areas else "no area match left after GP"
         )
+    whole = Matches.empty()
     if options.rule == "consensus":
         single = len(candidates) == 1
-        whole = match_whole() if whole_is_known or single else Matches.empty()
+        whole = match_whole() if whole_is_known or single else whole
         judged, model, fallback = _consensus(candidates, whole, single, estimate, geometry, options)
     else:
         judged = _RULES[options.rule](candidates, estimate, geometry, options)
@@ -53,7 +54,8 @@ def reject(
     if not kept and not fallback:
         fallback = f"GR rejected all: {len(candidates)} area matches"
     if not fallback:
-        model = estimate(_pool(kept, options.max_pooled)) or model
+        pool = _pool(kept, options.max_pooled)
+        model = estimate(Matches.concatenate([pool, _best(whole, len(pool))])) or model
     counted = tuple(_counted(area, model, geometry) for area in judged_all)
     return Verdict(areas=counted, model=model, fallback=fallback)
 

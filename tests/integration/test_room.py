@@ -95,8 +95,9 @@ def test_matches_of_overlapping_pairs_are_true(room, results):
         assert (distances < 3).mean() > 0.7  # a tenth of the matcher's are outliers, and a few pixels lie on edges
 
 
-def test_gmc_adds_true_matches_where_areas_cover_little(room, results, point_matcher):
-    everywhere = match_all(room, point_matcher, changed(SGAMOptions(), collection__min_coverage=1.0))
+def test_gmc_adds_true_matches_where_areas_cover_little(room, point_matcher):
+    everywhere = match_all(room, point_matcher, SGAMOptions())
+    little = match_all(room, point_matcher, changed(SGAMOptions(), collection__min_coverage=0.3))
     never = match_all(room, point_matcher, changed(SGAMOptions(), collection__rule="none"))
     distances = [errors(room, pair, r)[r.matches.area_index < 0] for pair, r in everywhere.items() if not r.fallback]
     gained = np.concatenate(distances)
@@ -104,7 +105,8 @@ def test_gmc_adds_true_matches_where_areas_cover_little(room, results, point_mat
     assert (gained < 5).mean() > 0.8
     for pair, result in never.items():
         assert result.fallback or (result.matches.area_index >= 0).all()
-        assert len(result.matches) <= len(results[pair].matches) <= len(everywhere[pair].matches)
+        assert len(result.matches) <= len(little[pair].matches)
+    assert sum(len(r.matches) for r in little.values()) < sum(len(r.matches) for r in everywhere.values())
 
 
 def test_tracks_follow_points_of_the_room(room, results):

@@ -200,12 +200,12 @@ def test_gmc_collects_consistent_whole_image_matches_only_where_areas_cover_litt
     inside = two_views(200, noise=0.3, outliers=0, seed=1, window=WINDOWS[0]).matches
     whole = two_views(600, noise=0.3, outliers=0.5, seed=2).matches
     model = estimate(two_views(500, noise=0.1, outliers=0, seed=3).matches)
-    found = collect([inside], 0.1, model, lambda: whole, CollectionOptions())
+    found = collect([inside], 0.1, model, lambda: whole, CollectionOptions(min_coverage=0.3))
     assert 250 < len(found) < 330
-    assert len(collect([inside], 0.5, model, lambda: whole, CollectionOptions())) == 0
-    assert len(collect([inside], 0.1, None, lambda: whole, CollectionOptions())) == 0
-    literal = collect([inside], 0.1, model, lambda: whole, CollectionOptions(rule="paper-literal"))
-    paper = collect([inside], 0.1, model, lambda: whole, CollectionOptions(rule="paper"))
+    assert len(collect([inside], 0.5, model, lambda: whole, CollectionOptions(min_coverage=0.3))) == 0
+    assert len(collect([inside], 0.1, None, lambda: whole, CollectionOptions(min_coverage=0.3))) == 0
+    literal = collect([inside], 0.1, model, lambda: whole, CollectionOptions(rule="paper-literal", min_coverage=0.3))
+    paper = collect([inside], 0.1, model, lambda: whole, CollectionOptions(rule="paper", min_coverage=0.3))
     assert len(paper) < len(found) < len(literal)
 
 
