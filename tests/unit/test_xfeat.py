@@ -24,7 +24,7 @@ def crop():
     ("size", "scale", "bound"), [((333, 251), 1.0, 0.03), ((251, 317), 1.2, 0.1), ((317, 245), 0.8, 0.1)]
 )
 def test_coordinates_are_unbiased_at_odd_sizes_and_changes_of_scale(matcher, monkeypatch, size, scale, bound):
-    # Shifts that sample the phases of the 8-pixel cells, and both turns. Between scales the network alone is less exact:
+    # Shifts that sample the phases of the 8-pixel cells, and both turns. Between scales the network is less exact:
     # there its error depends on how the cells of the two sides lie.
     matcher.reset()
     first = whole(view(np.eye(3), size), "first")
