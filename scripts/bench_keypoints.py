@@ -2,9 +2,8 @@
 
     python scripts/bench_keypoints.py RAW IMAGES OUT [--cameras CAMERAS] [--cell-px 3]
 
-RAW: an HDF5 file with one group per pair, its attributes `name0` and `name1` the images, its datasets `points0`,
-`points1` (M, 2; full-image pixels, corner origin), `scores`, `sigmas0`, `sigmas1` (M,). Both variants get the same raw
-matches, are verified and mapped under OUT, and their figures are printed as JSON.
+RAW: the output folder of a run, such as one with `--area-matcher none`. Both variants get its raw matches, are verified
+and mapped under OUT, and their figures are printed as JSON.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
-import h5py
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -27,6 +25,7 @@ from sgam_core.types import Matches
 from sgam_sfm.database import CameraOptions, import_cameras, write_database
 from sgam_sfm.keypoints import KeypointOptions, merge_keypoints
 from sgam_sfm.mapping import map_images, verify
+from sgam_sfm.store import read_pairs_of
 
 Pair = tuple[str, str]
 
@@ -92,13 +91,10 @@ def main() -> None:
     )
 
 
-def read_raw(path: Path) -> dict[Pair, Matches]:
-    """Raw matches by pair."""
-    with h5py.File(path) as file:
-        return {
-            (group.attrs["name0"], group.attrs["name1"]): Matches(**{name: data[()] for name, data in group.items()})
-            for group in file.values()
-        }
+def read_raw(output: Path) -> dict[Pair, Matches]:
+    """The raw matches of a finished run."""
+    records = ((record.pair, record.result) for record in read_pairs_of(output))
+    return {pair: result.matches for pair, result in records if result is not None and len(result.matches)}
 
 
 def round_to_cells(
