@@ -43,7 +43,7 @@ class KeypointOptions:
 
     cluster_radius_px: float = 0.33  # points of one image within it are one keypoint
     track_radius_px: float = 5.0  # keypoints of one image within it may become one in a track; 0: never
-    min_shared_images: int = 2  # join two tracks that run within the track radius in so many images; 0: never
+    min_shared_images: int = 1  # join two tracks that run within the track radius in so many images; 0: never
     max_residual_sigmas: float = 1.0  # drop a match further from its aligned keypoints; sigma: 1 px either side; 0: off
 
     def __post_init__(self) -> None:
