@@ -80,32 +80,29 @@ def match_described(
     clock.lap("GP")
     verdict = reject(areas, points.whole, points.whole_is_known, estimate, options.geometry, options.rejection)
     clock.lap("GR")
-    kept = [area for area in verdict.areas if area.area.state is AreaState.KEPT and not verdict.fallback]
-    shares = [
-        coverage([getattr(area.area, side).box for area in kept], image.width, image.height)
-        for side, image in (("area0", image0), ("area1", image1))
-    ]
+    areas = [_final(area, verdict.fallback) for area in verdict.areas]
+    kept = {index: area for index, area in enumerate(areas) if area.area.state is AreaState.KEPT}
+    coverage0 = coverage([area.area.area0.box for area in kept.values()], image0.width, image0.height)
+    coverage1 = coverage([area.area.area1.box for area in kept.values()], image1.width, image1.height)
     if verdict.fallback:
         matches = points.whole()
         model = estimate(matches)
     else:
         inside = [
             replace(area.matches, area_index=np.full(len(area.matches), index, np.int32))
-            for index, area in enumerate(verdict.areas)
-            if area.area.state is AreaState.KEPT
+            for index, area in kept.items()
         ]
-        collected = collect(inside, min(shares), verdict.model, points.whole, options.collection)
+        collected = collect(inside, min(coverage0, coverage1), verdict.model, points.whole, options.collection)
         matches, model = merge(inside, collected, options.collection), verdict.model
     clock.lap("GMC")
-    whole_scales = [whole_crop(image, options.crop).scale for image in (image0, image1)]
     return PairResult(
         matches=matches,
-        areas=tuple(_final(area.area, verdict.fallback) for area in verdict.areas),
+        areas=tuple(area.area for area in areas),
         two_view=model,
-        coverage0=shares[0],
-        coverage1=shares[1],
-        whole_scale0=whole_scales[0],
-        whole_scale1=whole_scales[1],
+        coverage0=coverage0,
+        coverage1=coverage1,
+        whole_scale0=whole_crop(image0, options.crop).scale,
+        whole_scale1=whole_crop(image1, options.crop).scale,
         fallback=verdict.fallback,
         notes=putative.notes + points.notes,
         pixels_matched=points.pixels,
@@ -124,10 +121,10 @@ class WholeImages:
         return PutativeAreas()
 
 
-def _final(area: AreaMatch, fallback: str) -> AreaMatch:
-    """Areas that were fine themselves but whose pair fell back."""
-    if fallback and area.state is AreaState.KEPT:
-        return replace(area, state=AreaState.REJECTED, reason=f"pair fell back: {fallback}")
+def _final(area: MatchedArea, fallback: str) -> MatchedArea:
+    """The area, rejected when it was fine itself but its pair fell back."""
+    if fallback and area.area.state is AreaState.KEPT:
+        return area.resolved(AreaState.REJECTED, f"pair fell back: {fallback}")
     return area
 
 

@@ -39,16 +39,15 @@ def collect(
     """
     if options.rule == "none" or smaller_coverage >= options.min_coverage or model is None:
         return Matches.empty()
-    means = [float(residuals(model.F, matches).mean()) for matches in inside if len(matches)]
-    sums = [float(residuals(model.F, matches).sum()) for matches in inside if len(matches)]
+    found = [residuals(model.F, matches) for matches in inside if len(matches)]
     if options.rule == "paper":
-        bound = float(np.mean(means))
+        bound = float(np.mean([r.mean() for r in found]))
     elif options.rule == "paper-literal":
-        bound = float(np.mean(sums))
+        bound = float(np.mean([r.sum() for r in found]))
     else:
         # Differs from the paper: the median keeps one stray match from opening the gate, and 1 is the resolution of
         # the matcher itself.
-        bound = max(2 * float(np.median(means)), 1.0)
+        bound = max(2 * float(np.median([r.mean() for r in found])), 1.0)
     whole = match_whole()
     return whole.select(residuals(model.F, whole) <= bound)
 
@@ -73,8 +72,9 @@ def _first_of_duplicates(matches: Matches, duplicate_px: float) -> np.ndarray:
     if len(matches) and duplicate_px > 0:
         pairs = cKDTree(matches.points0).query_pairs(duplicate_px, output_type="ndarray")
         apart = np.linalg.norm(matches.points1[pairs[:, 0]] - matches.points1[pairs[:, 1]], axis=1)
-        for i, j in pairs[np.lexsort(pairs.T)][apart[np.lexsort(pairs.T)] <= duplicate_px].tolist():
-            keep[max(i, j)] &= not keep[min(i, j)]
+        same = pairs[apart <= duplicate_px]  # the lower row first
+        for i, j in same[np.lexsort(same.T)].tolist():
+            keep[j] &= not keep[i]
     return keep
 
 

@@ -24,9 +24,9 @@ class MatchedArea:
     area: AreaMatch
     matches: Matches
 
-    def resolved(self, state: AreaState, reason: str = "", *, predicted: bool = False) -> MatchedArea:
+    def resolved(self, state: AreaState, reason: str = "") -> MatchedArea:
         """The same area match in another state."""
-        return replace(self, area=replace(self.area, state=state, reason=reason, predicted=predicted))
+        return replace(self, area=replace(self.area, state=state, reason=reason))
 
 
 def predict(
@@ -47,7 +47,7 @@ def predict(
     passed_over = [c for group in doubtful for c in group if c.area.state is AreaState.SKIPPED]
     if not options.enabled:
         return passed_over + [c.resolved(AreaState.UNRESOLVED, "GP is off") for group in tried for c in group]
-    anchor = estimate(Matches.concatenate([area.matches for area in confident])) if confident else None
+    anchor = estimate(Matches.concatenate([area.matches for area in confident])) if confident and tried else None
     judged = []
     for group in tried:
         if anchor is not None:
@@ -104,7 +104,7 @@ def _judge(
             AreaState.UNRESOLVED,
             f"GP: ambiguous, costs {cost[key]:.2f} and {min(rivals):.2f} differ by less than {options.min_lead:.0%}",
         )
-    return candidate.resolved(AreaState.KEPT, predicted=True)
+    return replace(candidate, area=replace(candidate.area, predicted=True))
 
 
 def _enumerate(

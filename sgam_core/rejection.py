@@ -93,9 +93,9 @@ def _judge(
     inlier = residuals(model.F, candidate.matches) <= geometry.max_residual
     count, total = int(inlier.sum()), len(candidate.matches)
     if count < options.min_inliers:
-        return _rejected(candidate, f"GR: {count} inliers of {total}, below {options.min_inliers}")
+        return candidate.resolved(AreaState.REJECTED, f"GR: {count} inliers of {total}, below {options.min_inliers}")
     if total - count > options.max_outlier_share * total:
-        return _rejected(candidate, f"GR: {count} inliers of {total}, the rest contradict the pair")
+        return candidate.resolved(AreaState.REJECTED, f"GR: {count} inliers of {total}, the rest contradict the pair")
     return candidate
 
 
@@ -133,13 +133,9 @@ def _threshold(candidates: Sequence[MatchedArea], consistency: np.ndarray, bound
     return [
         candidate
         if value <= bound and np.isfinite(value)
-        else _rejected(candidate, f"GR: consistency {value:.3g} above {bound:.3g}")
+        else candidate.resolved(AreaState.REJECTED, f"GR: consistency {value:.3g} above {bound:.3g}")
         for candidate, value in zip(candidates, consistency.tolist(), strict=True)
     ]
-
-
-def _rejected(candidate: MatchedArea, reason: str) -> MatchedArea:
-    return candidate.resolved(AreaState.REJECTED, reason, predicted=candidate.area.predicted)
 
 
 def _distance(model: TwoViewModel | None, area: MatchedArea, geometry: GeometryOptions) -> float:

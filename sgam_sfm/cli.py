@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 from rich.logging import RichHandler
+from rich.markup import escape
 
 from sgam_core.errors import OptionError, SGAMError
 from sgam_sfm.options import MatchOptions, merged, read_config, with_preset
@@ -60,12 +61,9 @@ def run(arguments: Sequence[str]) -> int:
             args=arguments,
         )
         return _match(command, console) if isinstance(command, MatchOptions) else _demo(command, console)
-    except OptionError as error:
-        console.print(f"[red]error:[/red] {error}", highlight=False, soft_wrap=True)
-        return USAGE
     except SGAMError as error:
-        console.print(f"[red]error:[/red] {error}", highlight=False, soft_wrap=True)
-        return ERROR
+        console.print(f"[red]error:[/red] {escape(str(error))}", highlight=False, soft_wrap=True)
+        return USAGE if isinstance(error, OptionError) else ERROR
     except KeyboardInterrupt:
         console.print("stopped; the same command continues where it was")
         return INTERRUPTED

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from sgam_sfm.options import MatchOptions
 from sgam_sfm.pictures import draw_areas, write_png
 from sgam_sfm.progress import Stages
 from sgam_sfm.runner import match_collection
-from sgam_sfm.scene import View, demo_views, write_scene
+from sgam_sfm.scene import demo_views, write_scene
 from sgam_sfm.store import PairRecord, read_pairs_of
 from sgam_sfm.summary import print_summary
 
@@ -34,7 +33,7 @@ def run_demo(output: Path, device: str, threads: int, console: Console) -> tuple
     if not (scene / "pairs.txt").exists():  # written last
         views = demo_views()
         with stages.stage("Rendering the room", len(views)) as advance:
-            write_scene(scene, views, advance=_one_by_one(advance))
+            write_scene(scene, views, advance=lambda _: advance(1))
     options = MatchOptions(
         images=scene / "images", pairs=scene / "pairs.txt", output=output / "sgam", device=device, threads=threads
     )
@@ -48,10 +47,6 @@ def run_demo(output: Path, device: str, threads: int, console: Console) -> tuple
         write_json(options.output / "summary.json", summary)
         console.print(_truth(errors), highlight=False, soft_wrap=True)
     return options, summary
-
-
-def _one_by_one(advance: Callable[[float], None]) -> Callable[[View], None]:
-    return lambda view: advance(1)
 
 
 def _truth(errors: PoseErrors) -> str:

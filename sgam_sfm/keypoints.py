@@ -27,11 +27,10 @@ from scipy.spatial import cKDTree
 
 from sgam_core.errors import InputError, OptionError, ShapeError
 from sgam_core.types import Matches
+from sgam_sfm.pairs import Pair
 from sgam_sfm.tracks import align_keypoints, link_tracks, local_affine
 
 logger = logging.getLogger(__name__)
-
-Pair = tuple[str, str]
 
 _MIN_WEIGHT = 1e-3  # a match of score 0 still has a place
 _OCTAVE = 2.0  # points whose sigma is so many times the finest have no say in where a keypoint lies

@@ -27,6 +27,7 @@ from statistics import median
 from typing import Any
 
 from sgam_core.errors import InputError, OptionError, StageError
+from sgam_sfm.machine import peak_memory_mb
 from sgam_sfm.pairs import Pair
 
 Progress = Callable[[str, int, int], None]
@@ -450,19 +451,6 @@ def _counting_rows(database_path: str, table: str, report: Callable[[int], None]
         thread.join()
 
 
-def _peak_memory_mb() -> float | None:
-    """The most memory this process has held. None where the system does not tell (Windows)."""
-    status = Path("/proc/self/status")
-    if status.exists():  # on Linux ru_maxrss starts at what the parent held
-        peak = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
-        return int(peak.split()[1]) / 1024
-    try:
-        import resource
-    except ImportError:
-        return None
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2  # bytes on macOS
-
-
 def _main() -> None:
     # The parent reads our lines only: what native code prints to standard output joins its log on standard error.
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
@@ -475,7 +463,7 @@ def _main() -> None:
     job = json.load(sys.stdin)
     stage = {"verification": _verify, "comparison": _compare}.get(job["stage"], _map)
     result = stage(job, lambda step, done, total: write({"step": step, "done": done, "total": total}))
-    write({"result": {**result, "peak_memory_mb": _peak_memory_mb()}})
+    write({"result": {**result, "peak_memory_mb": peak_memory_mb()}})
 
 
 if __name__ == "__main__":

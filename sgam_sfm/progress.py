@@ -1,9 +1,8 @@
-"""Stages of a run: a progress bar with an ETA while one lasts, its seconds and peak memory once it is over."""
+"""Stages of a run: a progress bar with an ETA while one lasts, its seconds once it is over."""
 
 from __future__ import annotations
 
 import logging
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -45,13 +44,3 @@ class Stages:
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
             _log.info("%s: %.1f s", name, self.seconds[name])
-
-
-def peak_memory_mb() -> float | None:
-    """Peak resident memory of this process, MB; None where it cannot be told."""
-    if sys.platform == "win32":
-        return None
-    import resource
-
-    unit = 2**20 if sys.platform == "darwin" else 2**10  # bytes there, kilobytes elsewhere
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

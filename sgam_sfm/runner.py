@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.keypoints import merge_keypoints
 from sgam_sfm.label_maps import make_label_maps
+from sgam_sfm.machine import find_device, peak_memory_mb
 from sgam_sfm.mapping import (
     MappingOptions,
     MappingSummary,
@@ -29,8 +31,8 @@ from sgam_sfm.mapping import (
 from sgam_sfm.matching import CollectionMatcher, match_blocks
 from sgam_sfm.options import NOT_IN_RESULTS, MatchOptions, as_json, fingerprint
 from sgam_sfm.pairs import Pair, blocks
-from sgam_sfm.progress import Stages, peak_memory_mb
-from sgam_sfm.store import PairStore
+from sgam_sfm.progress import Advance, Stages
+from sgam_sfm.store import PairRecord, PairStore
 from sgam_sfm.summary import summarise_images, summarise_keypoints, summarise_pairs, versions
 
 
@@ -42,7 +44,7 @@ def match_collection(options: MatchOptions, stages: Stages | None = None) -> dic
     Raises: SGAMError for what cannot be used at all. Single images and pairs that fail are counted in the summary.
     """
     stages = stages or Stages(quiet=True)
-    options = replace(options, device=_device(options.device))
+    options = replace(options, device=str(find_device(options.device, "--device")))
     _use_threads(options.threads)
     point_matcher: PointMatcher = registry.create(
         "matcher", options.matcher, weights=options.weights, device=options.device, seed=options.seed
@@ -58,7 +60,8 @@ def match_collection(options: MatchOptions, stages: Stages | None = None) -> dic
     steps = match_blocks(work, store, matcher, stages)
 
     with stages.stage("Merging keypoints", None):
-        matches, inliers = stored_matches(store, len(work), options)
+        records = list(store.read_all(len(work)))
+        matches, inliers = stored_matches(records, options)
         merged = merge_keypoints(matches, options.keypoints, inliers)
         write_keypoints_h5(output / "keypoints.h5", merged.keypoints)
         counts = {name: len(points) for name, points in merged.keypoints.items()}
@@ -68,7 +71,7 @@ def match_collection(options: MatchOptions, stages: Stages | None = None) -> dic
 
     summary = {
         "images": summarise_images(inputs),
-        "pairs": summarise_pairs(inputs, store.read_all(len(work)), verified),
+        "pairs": summarise_pairs(inputs, records, verified),
         "labels": {} if labels is None else {"failed": labels.failed, **labels.facts},
         "keypoints": summarise_keypoints(merged),
         "models": [] if mapped is None else mapped.models,
@@ -128,11 +131,11 @@ def _flags(options: dict[str, Any], prefix: str = "--") -> dict[str, Any]:
 
 
 def stored_matches(
-    store: PairStore, num_blocks: int, options: MatchOptions
+    records: Sequence[PairRecord], options: MatchOptions
 ) -> tuple[dict[Pair, Matches], dict[Pair, np.ndarray]]:
     """The point matches of every pair that has any, and (M,) which of them agree with the pair's geometry."""
     matches, inliers = {}, {}
-    for record in store.read_all(num_blocks):
+    for record in records:
         if record.result is not None and len(record.result.matches):
             matches[record.pair] = record.result.matches
             model = record.result.two_view
@@ -146,44 +149,33 @@ def reconstruct(
 ) -> tuple[VerificationSummary, MappingSummary | None]:
     """COLMAP's verification, then its mapper unless --no-mapping."""
     database = options.output / "database.db"
-    with stages.stage("Verifying pairs", None):
-        verified = verify(database, VerificationOptions(seed=options.seed, threads=options.threads or -1))
+    with stages.stage("Verifying pairs", len(inputs.pairs.pairs)) as advance:
+        verification = VerificationOptions(seed=options.seed, threads=options.threads or -1)
+        verified = verify(database, verification, _relative(advance))
     if not options.mapping:
         return verified, None
     with stages.stage("Mapping", len(inputs.images)) as advance:
-        shown = 0
-
-        def progress(step: str, done: int, total: int) -> None:
-            nonlocal shown
-            advance(done - shown)
-            shown = done
-
         mapped = map_images(
             database,
             options.images,
             options.output / "sparse",
             MappingOptions(mapper=options.mapper, refine_intrinsics=options.refine_intrinsics, seed=options.seed),
-            progress,
+            _relative(advance),
             known_camera_ids={camera.camera_id for camera in inputs.cameras.values() if camera.known},
         )
     return verified, mapped
 
 
-def _device(name: str) -> str:
-    """`auto` becomes cuda where there is one.
+def _relative(advance: Advance) -> Callable[[str, int, int], None]:
+    """COLMAP's stages tell how far they are, a progress bar wants to know what is new."""
+    shown = 0
 
-    Raises: OptionError for a device that this machine does not have.
-    """
-    import torch
+    def progress(step: str, done: int, total: int) -> None:
+        nonlocal shown
+        advance(done - shown)
+        shown = done
 
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        torch.zeros(1, device=name)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise OptionError(f"--device '{name}' cannot be used ({reason}); use cpu or auto") from error
-    return name
+    return progress
 
 
 def _use_threads(number: int) -> None:

@@ -12,9 +12,8 @@ A block's file appears under its name only when it is whole, so that a block eit
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +24,10 @@ from pydantic_core import to_jsonable_python
 
 from sgam_core import AreaMatch, Matches, PairResult, TwoViewModel
 from sgam_core.errors import InputError
+from sgam_sfm.files import replacing
 from sgam_sfm.pairs import Pair
 
-_ARRAYS = ("points0", "points1", "scores", "sigmas0", "sigmas1", "area_index")
+_ARRAYS = tuple(array.name for array in fields(Matches))
 _AREAS = TypeAdapter(tuple[AreaMatch, ...])
 
 
@@ -66,13 +66,10 @@ class PairStore:
 
     def write(self, block: int, records: Sequence[PairRecord]) -> None:
         """Keep a whole block."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        partial = self.path(block).with_suffix(".partial")
-        with h5py.File(partial, "w", track_order=True) as file:
+        with replacing(self.path(block)) as partial, h5py.File(partial, "w", track_order=True) as file:
             file.attrs["fingerprint"] = self.fingerprint
             for index, record in enumerate(records):
                 _write_record(file.create_group(str(index)), record)
-        os.replace(partial, self.path(block))
 
     def read(self, block: int) -> Iterator[PairRecord]:
         """The records of a block, in its order."""

@@ -101,8 +101,8 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     if summary["labels"].get("num_labels_chosen"):
         stability = summary["labels"]["stability"][str(summary["labels"]["num_labels_chosen"])]
         table.add_row("labels", f"{summary['labels']['num_labels_chosen']}, runs agree by {stability:.2f}")
-    kept = sum(count for name, count in pairs["areas"].items() if name.endswith("_kept"))
     if pairs["areas"]:
+        kept = sum(count for name, count in pairs["areas"].items() if name.endswith("_kept"))
         gain = pairs["mean_resolution_gain"]
         table.add_row(
             "areas",
@@ -110,7 +110,6 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
             f"{sum(n for k, n in pairs['areas'].items() if k.endswith('_rejected'))} rejected; "
             f"{pairs['mean_coverage']:.0%} of the image, {gain:.1f}x the resolution",
         )
-    if pairs["areas"]:
         table.add_row(
             "fallbacks", ", ".join(f"{count} {reason}" for reason, count in pairs["fallbacks"].items()) or "none"
         )

@@ -72,7 +72,7 @@ class _Tracks:
 
 def _follow(links: list[int]) -> np.ndarray:
     target = np.array(links, np.int64)
-    while (further := target[target]).tolist() != target.tolist():
+    while not np.array_equal(further := target[target], target):
         target = further
     return target
 

@@ -29,6 +29,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Crop, Matches
+from sgam_sfm.machine import find_device
 from sgam_sfm.matchers.masks import wanted
 from sgam_sfm.matchers.subpixel import local_affines, refine
 from sgam_sfm.weights import XFEAT, find_weights
@@ -109,7 +110,7 @@ class XFeatStar:
             raise OptionError(f"features_per_megapixel is {features_per_megapixel}; expected at least 1")
         if min(scales) <= 0:
             raise OptionError(f"scales are {scales}; expected two positive factors")
-        self.device = _device(device)
+        self.device = find_device(device)
         self.features_per_megapixel = features_per_megapixel
         self.shares = ((scales[0], coarse_share), (scales[1], 1 - coarse_share))
         self.min_confidence = min_confidence
@@ -278,13 +279,3 @@ def _aligned(crop0: Crop, crop1: Crop, matches: Matches) -> Matches:
         points1=np.where(better[:, None], points1, matches.points1),
         scores=matches.scores * (1 + correlations) / 2,
     )
-
-
-def _device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise OptionError(f"device '{name}' cannot be used ({reason}); try 'cpu', or 'cuda' with a GPU") from error
-    return device

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -17,6 +16,7 @@ from jaxtyping import Float32, Int32
 from scipy.ndimage import gaussian_filter
 
 from sgam_core.errors import OptionError, SGAMError
+from sgam_sfm.files import replacing
 from sgam_sfm.images import ImageFile, read_image
 from sgam_sfm.segmenters.clustering import Projection, principal_components, stable_clusters
 from sgam_sfm.segmenters.dino import PatchFeatures
@@ -109,9 +109,8 @@ class CoSeg:
         features = _load(path)
         if features is None:
             features = self._patch_features(read_image(image))
-            with tempfile.NamedTemporaryFile(dir=cache, suffix=".partial", delete=False) as file:
+            with replacing(path) as partial, partial.open("wb") as file:
                 np.save(file, features)
-            os.replace(file.name, path)
         return gaussian_filter(features.astype(np.float32), (_SMOOTHING_SIGMA, _SMOOTHING_SIGMA, 0), mode="nearest")
 
     def _draw(self, image: ImageFile, features: np.ndarray, num_samples: int) -> Float32[np.ndarray, "N C"]:

@@ -1,0 +1,43 @@
+"""What this machine has and what this process has used of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sgam_core.errors import OptionError
+
+if TYPE_CHECKING:
+    import torch
+
+
+def find_device(name: str, named: str = "device") -> torch.device:
+    """The torch device of that name; `auto` is cuda where there is one.
+
+    Args: named: how a message calls what the user gave.
+    Raises: OptionError for a device that this machine does not have.
+    """
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise OptionError(f"{named} '{name}' cannot be used ({reason}); try 'cpu', or 'cuda' with a GPU") from error
+    return device
+
+
+def peak_memory_mb() -> float | None:
+    """The most memory this process has held, MB; None where the system does not tell (Windows)."""
+    status = Path("/proc/self/status")
+    if status.exists():  # on Linux ru_maxrss starts at what the parent held
+        peak = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
+        return int(peak.split()[1]) / 1024
+    try:
+        import resource
+    except ImportError:
+        return None
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2  # bytes on macOS
