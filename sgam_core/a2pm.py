@@ -113,6 +113,8 @@ def match_described(
 class WholeImages:
     """The area matcher `none`: proposes no area, so that the point matcher sees whole images. The baseline."""
 
+    needs_labels = False
+
     def describe(self, image: Image, labels: Int32[np.ndarray, "H W"] | None) -> None:
         """Nothing to describe."""
 

@@ -29,6 +29,11 @@ class PointMatcher(Protocol):
 class AreaMatcher(Protocol):
     """Finds areas of two images that show the same thing (AM in the paper)."""
 
+    @property
+    def needs_labels(self) -> bool:
+        """Whether `describe` wants a label map; without, nobody makes one."""
+        ...
+
     def describe(self, image: Image, labels: Int32[np.ndarray, "H W"] | None) -> Any:
         """All that depends on one image alone; computed once per image and handed to `match`."""
         ...

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -43,6 +44,7 @@ class SemanticDescription:
 class SemanticAreaMatcher:
     """The paper's area matcher, as an `AreaMatcher`."""
 
+    needs_labels: ClassVar[bool] = True
     options: SemanticOptions = field(default_factory=SemanticOptions)
 
     def describe(self, image: Image, labels: Int32[np.ndarray, "H W"] | None) -> SemanticDescription:

@@ -54,7 +54,7 @@ def match_collection(options: MatchOptions, stages: Stages | None = None) -> dic
 
     inputs = read_inputs(options, stages)
     store = open_store(options, inputs)
-    labels = make_label_maps(options, inputs.images, stages) if options.area_matcher == "sgam" else None
+    labels = make_label_maps(options, inputs.images, stages) if area_matcher.needs_labels else None
     work = blocks(inputs.pairs.pairs, options.block_images)
     matcher = CollectionMatcher(options, inputs, labels, area_matcher, point_matcher)
     steps = match_blocks(work, store, matcher, stages)
