@@ -67,11 +67,14 @@ def estimate_two_view(
     usac.loMethod = cv2.LOCAL_OPTIM_SIGMA
     usac.randomGeneratorState = options.seed
     found: np.ndarray | None
-    if camera0 is not None and camera1 is not None:
-        E, _ = cv2.findEssentialMat(matches.points0, matches.points1, camera0, camera1, None, None, usac)
-        found = None if E is None else np.linalg.inv(camera1).T @ E[:3] @ np.linalg.inv(camera0)
-    else:
-        found, _ = cv2.findFundamentalMat(matches.points0, matches.points1, usac)
+    try:
+        if camera0 is not None and camera1 is not None:
+            E, _ = cv2.findEssentialMat(matches.points0, matches.points1, camera0, camera1, None, None, usac)
+            found = None if E is None else np.linalg.inv(camera1).T @ E[:3] @ np.linalg.inv(camera0)
+        else:
+            found, _ = cv2.findFundamentalMat(matches.points0, matches.points1, usac)
+    except cv2.error:  # where local optimisation of planar matches leaves no model, OpenCV raises
+        return None
     if found is None or found.shape != (3, 3) or not np.isfinite(found).all() or not found.any():
         return None
     F = found / np.linalg.norm(found)
@@ -89,7 +92,10 @@ def _planarity(inliers: Matches, threshold: float) -> float:
     """Share of the inliers that one homography explains."""
     if len(inliers) < 4:
         return 1.0
-    H, on_plane = cv2.findHomography(
-        inliers.points0, inliers.points1, cv2.USAC_FAST, threshold, maxIters=500, confidence=0.99
-    )
+    try:
+        H, on_plane = cv2.findHomography(
+            inliers.points0, inliers.points1, cv2.USAC_FAST, threshold, maxIters=500, confidence=0.99
+        )
+    except cv2.error:
+        return 1.0
     return 1.0 if H is None else float(on_plane.mean())

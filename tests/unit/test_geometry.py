@@ -75,3 +75,16 @@ def test_estimates_repeat_bit_by_bit():
     assert first is not None
     assert second is not None
     np.testing.assert_array_equal(first.F, second.F)
+
+
+def test_planar_matches_that_leave_opencv_without_a_model_have_no_geometry():
+    rng = np.random.default_rng(12851)  # found by trying: OpenCV raises an error here
+    count = int(rng.integers(8, 60))
+    points0 = rng.uniform(0, (160, 120), (count, 2))
+    H = np.eye(3)
+    H[:2, :2] += rng.normal(0, 0.1, (2, 2))
+    H[:2, 2] = rng.normal(0, 8, 2)
+    mapped = np.c_[points0, np.ones(count)] @ H.T
+    points1 = mapped[:, :2] / mapped[:, 2:] + rng.normal(0, 1, (count, 2))
+    matches = Matches(points0=points0, points1=points1, scores=np.ones(count))
+    assert estimate_two_view(matches, None, None, GeometryOptions(threshold=1.5)) is None
