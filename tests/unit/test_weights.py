@@ -8,7 +8,7 @@ import pytest
 
 from sgam_core.errors import WeightsError
 from sgam_sfm import weights
-from sgam_sfm.weights import COARSE_LOFTR, DINOV2_FOCUS, XFEAT, WeightsSpec, find_weights
+from sgam_sfm.weights import COARSE_LOFTR, DINOV2_FOCUS, LOFTR_INDOOR, LOFTR_OUTDOOR, XFEAT, WeightsSpec, find_weights
 
 CONTENT = b"three layers and a bias"
 SPEC = WeightsSpec(
@@ -99,7 +99,8 @@ def test_no_package_is_looked_for_where_none_carries_the_file(hub):
     with pytest.raises(WeightsError) as error:
         find_weights(COARSE_LOFTR)
     message = str(error.value)
-    assert message.startswith(f"no coarse LoFTR weights; tried '{hub / 'coarse_loftr_teacher.onnx'}'; run `curl -L ")
+    tried = hub / "coarse_loftr_teacher.onnx"
+    assert message.startswith(f"no coarse LoFTR weights; tried '{tried}'; run `{COARSE_LOFTR.command}`, ")
     assert "github.com/Kolkir/Coarse_LoFTR_TRT" in message
     assert "\n" not in message
 
@@ -124,6 +125,42 @@ def test_changed_file_of_the_same_size_is_reported_with_both_checksums(hub):
     got, expected = hashlib.sha256(changed).hexdigest(), SPEC.sha256
     with pytest.raises(WeightsError, match=f"has SHA-256 {got}; expected {expected}; delete the file and run"):
         find_weights(replace(SPEC, package=""))
+
+
+@pytest.mark.parametrize("spec", [replace(SPEC, size=0, sha256="", package=""), LOFTR_OUTDOOR, LOFTR_INDOOR])
+def test_a_file_of_unknown_size_and_checksum_is_left_to_its_loader(hub, tmp_path, caplog, spec):
+    mine, cached = tmp_path / "mine.ckpt", hub / spec.cache_name
+    for path in (mine, cached):
+        path.write_bytes(b"anything")
+    assert find_weights(spec) == cached
+    assert find_weights(spec, mine) == mine
+    assert caplog.text == ""
+
+
+def test_of_size_and_checksum_each_is_checked_where_it_is_known(hub):
+    path = hub / "toy.pt"
+    path.write_bytes(CONTENT[::-1])
+    assert find_weights(replace(SPEC, package="", sha256="")) == path
+    with pytest.raises(WeightsError, match="has SHA-256"):
+        find_weights(replace(SPEC, package="", size=0))
+    path.write_bytes(CONTENT[:-1])
+    with pytest.raises(WeightsError, match=f"has {len(CONTENT) - 1} bytes; expected {len(CONTENT)}"):
+        find_weights(replace(SPEC, package="", sha256=""))
+
+
+@pytest.mark.parametrize(
+    ("spec", "name", "file"),
+    [(LOFTR_OUTDOOR, "outdoor", "loftr_outdoor.ckpt"), (LOFTR_INDOOR, "indoor_new", "loftr_indoor_ds_new.ckpt")],
+)
+def test_loftr_is_kept_under_the_names_and_fetched_from_where_kornia_has_it(spec, name, file):
+    from kornia.feature.loftr.loftr import urls
+
+    official = [urls[name]] if isinstance(urls[name], str) else urls[name]
+    assert spec.cache_name == file
+    assert spec.url.endswith(f"/{file}")
+    assert all(url.endswith(f"/{file}") for url in official)
+    if any("huggingface" in url for url in official):  # since kornia 0.9
+        assert spec.url in official
 
 
 def test_hub_folder_follows_the_environment_as_torch_does(monkeypatch, tmp_path):
