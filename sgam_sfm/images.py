@@ -6,7 +6,10 @@ import hashlib
 import io
 import os
 import struct
+import unicodedata
+import warnings
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +24,11 @@ _COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", 
 # COLMAP does not read these: listed too, so that a later step can name them in place of silently passing them over.
 _OTHER_SUFFIXES = frozenset({".webp", ".gif", ".jp2", ".heic", ".heif", ".avif", ".jxl"})
 
+# File systems allow 255; label maps are written as .<name>.png.<process>.partial.
+_MAX_NAME_BYTES = 230
+# Areas are found at a fixed width, at which a narrower strip is millions of pixels high.
+_MAX_ASPECT = 50
+
 # Pillow applies the orientation of TIFF files (and of no other format) when it decodes them: this undoes it.
 _UPRIGHT_TO_STORED = {
     2: PillowImage.Transpose.FLIP_LEFT_RIGHT,
@@ -33,6 +41,8 @@ _UPRIGHT_TO_STORED = {
 }
 # Pillow spreads the values of grey PNGs of 2 and 4 bits over 0..255: right for images, wrong for ids.
 _GREY_STEP = {"L;2": 85, "L;4": 17}
+# Those of the suffixes above: Pillow knows many more, and runs an interpreter on some (EPS).
+_FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "PPM", "TGA", "WEBP", "GIF", "JPEG2000")
 # All that Pillow's decoders are known to raise on broken files.
 _DECODE_ERRORS = (
     OSError,
@@ -41,7 +51,6 @@ _DECODE_ERRORS = (
     EOFError,
     struct.error,
     zlib.error,
-    PillowImage.DecompressionBombError,
 )
 
 
@@ -62,7 +71,8 @@ class ImageFile:
 def list_images(folder: Path) -> tuple[tuple[str, ...], int]:
     """Names of the images in a folder and its sub-folders, sorted, and how many other files were passed over.
 
-    Hidden files and folders (a leading dot) are neither listed nor counted.
+    Hidden files and folders (a leading dot) are neither listed nor counted. Links are followed; every folder is listed
+    once, under its own name where it has one. A link that leads nowhere is listed, for a later step to name it.
     Raises: InputError when the folder is missing, cannot be read, or holds no image.
     """
     if not folder.is_dir():
@@ -70,16 +80,11 @@ def list_images(folder: Path) -> tuple[tuple[str, ...], int]:
         raise InputError(f"image folder '{folder}' {what}; give the folder that holds the images")
     names: list[str] = []
     num_others = 0
-    for parent, folders, files in os.walk(folder, onerror=_refuse_folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        for file in files:
-            path = Path(parent, file)
-            if file.startswith("."):
-                continue
-            if path.suffix.lower() in _COLMAP_SUFFIXES | _OTHER_SUFFIXES:
-                names.append(path.relative_to(folder).as_posix())
-            else:
-                num_others += 1
+    for path in _files(folder):
+        if path.suffix.lower() in _COLMAP_SUFFIXES | _OTHER_SUFFIXES or _leads_nowhere(path):
+            names.append(path.relative_to(folder).as_posix())
+        else:
+            num_others += 1
     if not names:
         raise InputError(
             f"image folder '{folder}' holds no image ({num_others} other files); expected jpg, png, tif, bmp or ppm"
@@ -90,15 +95,49 @@ def list_images(folder: Path) -> tuple[tuple[str, ...], int]:
 def inspect_image(folder: Path, name: str) -> ImageFile:
     """Decode an image once to know its size, that it is whole, and the digest of its content.
 
-    Raises: InputError when the file is missing, truncated, broken, or of a kind that cannot be decoded.
+    Raises: InputError when the file is missing, truncated, broken, or of a kind that cannot be decoded, a strip,
+        or its name is too long or cannot be written to a database and a log.
     """
+    if printable(name) != name:
+        raise InputError(
+            f"image '{printable(name)}' has a character in its name that cannot be used (a control character, or bytes "
+            "that are not UTF-8); rename it"
+        )
+    length = len(os.fsencode(Path(name).name))
+    if length > _MAX_NAME_BYTES:
+        raise InputError(
+            f"image '{name}' has a file name of {length} bytes; expected at most {_MAX_NAME_BYTES}, since its label "
+            "map gets a longer one: rename it"
+        )
     path = folder / name
+    if _leads_nowhere(path):
+        raise InputError(
+            f"image '{name}' is a link to '{path.readlink()}', where there is no file; set the link again or remove it"
+        )
+    if os.path.exists(path) and not os.path.isfile(path):  # a pipe would be waited for
+        raise InputError(f"image '{name}' is not a regular file but a folder, pipe or device; remove it")
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"image '{name}' cannot be read from '{folder}' ({_reason(error)}); check the name") from error
+        remedy = "its permissions" if isinstance(error, PermissionError) else "the name"
+        raise InputError(f"image '{name}' cannot be read from '{folder}' ({_reason(error)}); check {remedy}") from error
     height, width = _rgb(_decode(data, name), name).shape[:2]
+    if max(height, width) > _MAX_ASPECT * min(height, width):
+        raise InputError(
+            f"image '{name}' is {width}x{height} (width x height), a strip more than {_MAX_ASPECT} times as long as "
+            "wide; crop it, or remove it"
+        )
     return ImageFile(name=name, path=path, width=width, height=height, digest=hashlib.sha256(data).hexdigest())
+
+
+def image_format(path: Path) -> str:
+    """The format of an image that has been decoded, whatever its name says: JPEG, PNG, WEBP, ..."""
+    return str(_decode(_read(path, "image"), path.name).info["format"])
+
+
+def printable(name: str) -> str:
+    """A file name with the characters escaped that cannot be written to a log or a database."""
+    return "".join(repr(c)[1:-1] if unicodedata.category(c) in ("Cc", "Cs") else c for c in name)
 
 
 def read_image(file: ImageFile | Path) -> UInt8[np.ndarray, "H W 3"]:
@@ -146,8 +185,33 @@ def read_label_map(path: Path) -> Int32[np.ndarray, "H W"]:
     return np.asarray(picture).astype(np.int32) // picture.info.get("grey_step", 1)
 
 
-def _refuse_folder(error: OSError) -> None:
-    raise InputError(f"folder '{error.filename}' cannot be read ({_reason(error)}); check its permissions") from error
+def _files(root: Path) -> Iterator[Path]:
+    """The files of a folder and its sub-folders, without hidden ones; linked folders come after real ones."""
+    folders, links = [root], list[Path]()
+    seen = {*root.resolve().parents}  # a link to one of these leads back here
+    while folders or links:
+        folder = folders.pop() if folders else links.pop(0)
+        if folder.resolve() in seen:
+            continue
+        seen.add(folder.resolve())
+        try:
+            entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+        except OSError as error:
+            raise InputError(f"folder '{folder}' cannot be read ({_reason(error)}); check its permissions") from error
+        for entry in entries:
+            path = folder / entry.name
+            if entry.name.startswith("."):
+                continue
+            if not os.path.isdir(path):  # unlike pathlib's, False where access is denied
+                yield path
+            elif entry.is_symlink():
+                links.append(path)
+            else:
+                folders.append(path)
+
+
+def _leads_nowhere(path: Path) -> bool:
+    return os.path.islink(path) and not os.path.exists(path)
 
 
 def _read(path: Path, what: str) -> bytes:
@@ -158,19 +222,32 @@ def _read(path: Path, what: str) -> bytes:
 
 
 def _decode(data: bytes, name: str) -> PillowImage.Image:
+    """The first picture of a file; `info` keeps its format, and what its values are to be divided by to be ids."""
+    if not data:
+        raise InputError(f"'{name}' is empty (0 bytes); copy it again from its source, or remove it")
     try:
-        picture: PillowImage.Image = PillowImage.open(io.BytesIO(data))
-        grey_step = _GREY_STEP.get(_raw_mode(picture), 1)
-        orientation = picture.getexif().get(ExifTags.Base.Orientation) if picture.format == "TIFF" else None
-        picture.load()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about broken metadata and many pixels: neither matters here
+            picture: PillowImage.Image = PillowImage.open(io.BytesIO(data), formats=_FORMATS)
+            kind = picture.format
+            grey_step = _GREY_STEP.get(_raw_mode(picture), 1)
+            orientation = picture.getexif().get(ExifTags.Base.Orientation) if kind == "TIFF" else None
+            picture.load()
+    except PillowImage.DecompressionBombError as error:
+        limit = 2 * (PillowImage.MAX_IMAGE_PIXELS or 0) // 10**6
+        raise InputError(f"'{name}' has more than {limit} million pixels; make it smaller, or remove it") from error
     except _DECODE_ERRORS as error:
+        if any(mark in data[:1024].lower() for mark in (b"<!doctype html", b"<html")):
+            raise InputError(
+                f"'{name}' is a web page and not an image, so its download failed; download it again, or remove it"
+            ) from error
         raise InputError(
             f"'{name}' cannot be decoded ({_reason(error)}); copy it again from its source, convert it to JPEG or PNG, "
             "or remove it"
         ) from error
     if orientation in _UPRIGHT_TO_STORED:
         picture = picture.transpose(_UPRIGHT_TO_STORED[orientation])
-    picture.info["grey_step"] = grey_step
+    picture.info |= {"grey_step": grey_step, "format": kind}
     return picture
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from sgam_core.errors import InputError, OptionError
 from sgam_sfm.database import CameraInfo, CameraOptions, import_cameras
-from sgam_sfm.images import ImageFile, inspect_image, list_images
+from sgam_sfm.images import ImageFile, image_format, inspect_image, list_images, printable
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import PairList, all_pairs, read_pairs
 from sgam_sfm.progress import Stages
@@ -22,6 +23,7 @@ class Inputs:
 
     images: those that the pairs name, by name. cameras: one for each. failed: images that cannot be used, and why.
     num_other_files: files in the folder that are no images. pairs: those to match, and counts of what was left out.
+    num_same_content: usable images of the folder whose file equals another one's byte by byte.
     """
 
     images: Mapping[str, ImageFile]
@@ -29,6 +31,7 @@ class Inputs:
     failed: Mapping[str, str]
     num_other_files: int
     pairs: PairList
+    num_same_content: int = 0
 
 
 def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
@@ -39,18 +42,11 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
     for flag, folder in (("--mask-path", options.mask_path), ("--labels", options.labels)):
         if folder is not None and not folder.is_dir():
             raise InputError(f"{flag} '{folder}' does not exist; give the folder that holds <image name>.png")
-    if options.output.resolve().is_relative_to(options.images.resolve()):
-        raise OptionError(f"--output '{options.output}' lies in the image folder; choose one outside of it")
-    names, num_other_files = list_images(options.images)
-    images: dict[str, ImageFile] = {}
-    failed: dict[str, str] = {}
-    with stages.stage("Reading images", len(names)) as advance:
-        for name in names:
-            try:
-                images[name] = inspect_image(options.images, name)
-            except InputError as error:
-                failed[name] = str(error)
-            advance(1)
+    found = read_images(options.images, options.output, stages)
+    images, failed = found.images, found.failed
+    num_listed = len(images) + len(failed)
+    _check_any(images, failed, options.images)
+    with stages.stage("Reading cameras", None):
         imported = import_cameras(
             options.output / "cameras.db",
             options.images,
@@ -63,23 +59,71 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
             ),
         )
     for name, reason in imported.failures.items():
-        failed[name] = f"'{name}': {reason}"
+        failed[name] = f"'{name}' ({image_format(images[name].path)}): {reason}"
         del images[name]
-    for reason in failed.values():
-        _log.warning("%s", reason)
-    if not images:
-        raise InputError(f"none of the {len(names)} images in '{options.images}' can be used: {min(failed.values())}")
+        _log.warning("%s", failed[name])
+    same = same_content(images.values())
+    if same:
+        _log.warning("%d images have the same content as another, such as '%s' and '%s'", len(same), *same[:2])
+    _check_any(images, failed, options.images)
     if options.pairs is None:
         pairs = PairList(pairs=all_pairs(tuple(images)))
     else:
         pairs = read_pairs(options.pairs, tuple(images), tuple(failed))
     if not pairs.pairs:
-        raise InputError(f"no pair to match: {len(images)} of {len(names)} images in '{options.images}' can be used")
+        why = "each listed pair names another one" if options.pairs else "a pair needs two"
+        raise InputError(
+            f"no pair to match: {len(images)} of {num_listed} images in '{options.images}' can be used, and {why}"
+        )
     used = {name for pair in pairs.pairs for name in pair}
     return Inputs(
         images={name: file for name, file in images.items() if name in used},
         cameras=imported.cameras,
         failed=failed,
-        num_other_files=num_other_files,
+        num_other_files=found.num_other_files,
         pairs=pairs,
+        num_same_content=len(same),
     )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FoundImages:
+    """The images of a folder: those that can be used, and why others cannot; how many files are no images."""
+
+    images: dict[str, ImageFile]
+    failed: dict[str, str]
+    num_other_files: int
+
+
+def read_images(folder: Path, output: Path, stages: Stages) -> FoundImages:
+    """Decode every image of a folder once.
+
+    Raises: OptionError when results would go into the folder; InputError when it holds no image.
+    """
+    if output.resolve().is_relative_to(folder.resolve()):
+        raise OptionError(f"--output '{output}' lies in the image folder; choose one outside of it")
+    names, num_other_files = list_images(folder)
+    images: dict[str, ImageFile] = {}
+    failed: dict[str, str] = {}
+    with stages.stage("Reading images", len(names)) as advance:
+        for name in names:
+            try:
+                images[name] = inspect_image(folder, name)
+            except InputError as error:
+                failed[printable(name)] = str(error)
+                _log.warning("%s", error)
+            advance(1)
+    return FoundImages(images=images, failed=failed, num_other_files=num_other_files)
+
+
+def _check_any(images: Mapping[str, ImageFile], failed: Mapping[str, str], folder: Path) -> None:
+    if not images:
+        raise InputError(f"none of the {len(failed)} images in '{folder}' can be used: {min(failed.values())}")
+
+
+def same_content(images: Iterable[ImageFile]) -> tuple[str, ...]:
+    """The names of images whose files are equal, equal ones side by side."""
+    names: dict[str, list[str]] = {}
+    for image in images:
+        names.setdefault(image.digest, []).append(image.name)
+    return tuple(name for group in names.values() if len(group) > 1 for name in group)

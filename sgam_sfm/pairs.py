@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import codecs
 import difflib
+import io
+import posixpath
+import re
+import unicodedata
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from sgam_core.errors import InputError
 
@@ -32,22 +37,21 @@ class PairList:
 def read_pairs(path: Path, names: Sequence[str], unreadable: Collection[str] = ()) -> PairList:
     """Read a pair list: `nameA nameB` a line, as hloc and COLMAP write it.
 
-    Blank lines and lines that start with `#` are skipped. A tab separates names that contain spaces. The first spelling
-    of a pair decides its direction and place.
+    Blank lines and lines that start with `#` are skipped. A tab separates names that contain spaces. `./a.jpg` and
+    `sub\\a.jpg` are understood where `a.jpg` and `sub/a.jpg` exist. The first spelling of a pair decides its direction
+    and place.
 
     Args: names: the images of the collection; unreadable: images that exist but cannot be read, whose pairs are set
         aside rather than refused.
     Raises: InputError when the file cannot be read, a line does not name two known images, or no pair is left.
     """
-    known, broken = set(names), set(unreadable)
+    broken = set(unreadable)
+    known = broken.union(names)
     pairs: dict[Pair, None] = {}
     set_aside: dict[Pair, None] = {}
     num_repeated = num_reversed = num_self = 0
     for number, line in _lines(path):
-        name0, name1 = pair = _fields(line, path, number)
-        for name in pair:
-            if name not in known and name not in broken:
-                raise InputError(_unknown(name, known | broken, path, number))
+        name0, name1 = pair = _pair(line, known, f"{path}, line {number}")
         target = set_aside if broken.intersection(pair) else pairs
         if name0 == name1:
             num_self += 1
@@ -119,28 +123,60 @@ def blocks(pairs: Iterable[Pair], images_per_tile: int = 8) -> tuple[tuple[Pair,
 def _lines(path: Path) -> list[tuple[int, str]]:
     """The lines that carry data, with their numbers from 1."""
     try:
-        with path.open(encoding="utf-8-sig") as file:
-            lines = [(number, line.strip()) for number, line in enumerate(file, start=1)]
+        data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot read the pair list {path}: {error.strerror}") from error
+        raise InputError(
+            f"cannot read the pair list {path}: {error.strerror}; give a text file with lines of the form 'a.jpg b.jpg'"
+        ) from error
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise InputError(f"the pair list {path} is UTF-16 text, as some Windows programs write it; save it as UTF-8")
+    if b"\0" in data:
+        raise InputError(
+            f"the pair list {path} is not a text file; expected UTF-8 text with lines of the form 'a.jpg b.jpg'"
+        )
+    try:
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"the pair list {path} is not UTF-8 text; save it as UTF-8") from error
+    lines = [(number, line.strip()) for number, line in enumerate(io.StringIO(text, newline=None), start=1)]
     return [(number, line) for number, line in lines if line and not line.startswith("#")]
 
 
-def _fields(line: str, path: Path, number: int) -> Pair:
+def _pair(line: str, known: Collection[str], where: str) -> Pair:
     fields = [field.strip() for field in line.split("\t") if field.strip()] if "\t" in line else line.split()
     if len(fields) != 2:
         raise InputError(
-            f"{path}, line {number}: expected two image names but found {len(fields)}; separate names that contain "
-            "spaces by a tab"
+            f"{where}: expected two image names but found {len(fields)}; separate names that contain spaces by a tab"
         )
-    return fields[0], fields[1]
+    return _known_name(fields[0], known, where), _known_name(fields[1], known, where)
 
 
-def _unknown(name: str, known: Collection[str], path: Path, number: int) -> str:
+def _known_name(name: str, known: Collection[str], where: str) -> str:
+    """The image that a list means by this name, separators and `.` folded."""
+    if name in known:
+        return name
+    slashes = name.replace("\\", "/")
+    for other in (PurePosixPath(name).as_posix(), PurePosixPath(slashes).as_posix()):
+        if other in known:
+            return other
+    hint = _hint(name, known)
+    shown = re.sub(r"[\x00-\x1f\x7f]", "?", name if len(name) <= 120 else name[:117] + "...")
+    if slashes.startswith("/") or PureWindowsPath(name).is_absolute():
+        raise InputError(f"{where}: '{shown}' is an absolute path; names are relative to the image folder; {hint}")
+    if posixpath.normpath(slashes).startswith("../"):
+        raise InputError(f"{where}: '{shown}' leads out of the image folder; names are relative to that folder; {hint}")
+    raise InputError(f"{where}: '{shown}' is not among the {len(known)} images; {hint}")
+
+
+def _hint(name: str, known: Collection[str]) -> str:
+    names = sorted(known)
+    twin = next(
+        (other for other in names if unicodedata.normalize("NFC", other) == unicodedata.normalize("NFC", name)), ""
+    )
+    if twin:
+        return f"'{twin}' looks the same but has other Unicode characters (NFC and NFD): copy the name from the folder"
     # The folder is what a list most often leaves out.
-    homonyms = [other for other in sorted(known) if PurePosixPath(other).name == PurePosixPath(name).name]
-    closest = homonyms or difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.0)
-    hint = f"the closest name is '{closest[0]}'" if closest else "there are no images"
-    return f"{path}, line {number}: '{name}' is not among the {len(known)} images; {hint}"
+    file = PurePosixPath(name.replace("\\", "/")).name
+    homonyms = [other for other in names if PurePosixPath(other).name == file]
+    closest = homonyms or difflib.get_close_matches(name, names, n=1, cutoff=0.0)
+    return f"the closest name is '{closest[0]}'" if closest else "there are no images"

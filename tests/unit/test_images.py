@@ -1,15 +1,27 @@
 import hashlib
+import os
 import struct
+import warnings
 import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image as PillowImage
 
 from sgam_core.errors import InputError
-from sgam_sfm.images import ImageFile, inspect_image, list_images, read_image, read_label_map, read_mask
+from sgam_sfm.images import (
+    ImageFile,
+    image_format,
+    inspect_image,
+    list_images,
+    printable,
+    read_image,
+    read_label_map,
+    read_mask,
+)
 
 
 def save(path: Path, array: np.ndarray, **options: object) -> Path:
@@ -36,6 +48,34 @@ def test_list_is_sorted_posix_and_counts_the_others(tmp_path, colours):
     names, num_others = list_images(tmp_path)
     assert names == ("B.jpg", "a b.jpeg", "b.JPG", "photo.webp", "sub/a.png", "sub/deep/c.tif")
     assert num_others == 2
+
+
+def test_links_are_followed_and_every_folder_is_listed_once(tmp_path, colours):
+    save(tmp_path / "elsewhere/deep/c.png", colours)
+    images = tmp_path / "images"
+    save(images / "z/a.png", colours)
+    (images / "b.png").symlink_to("z/a.png")
+    (images / "linked").symlink_to(tmp_path / "elsewhere")
+    (images / "a").symlink_to("z")  # sorts before the folder, whose own name counts
+    (images / "z/up").symlink_to("..")
+    (images / "z/above").symlink_to(tmp_path)
+    (tmp_path / "elsewhere/back").symlink_to(images)
+    assert list_images(images) == (("b.png", "linked/deep/c.png", "z/a.png"), 0)
+    assert inspect_image(images, "linked/deep/c.png").width == 40
+
+
+def test_links_that_lead_nowhere_are_listed_to_be_named(tmp_path, colours):
+    save(tmp_path / "a.png", colours)
+    (tmp_path / "gone.png").symlink_to("moved/a.png")
+    (tmp_path / "day2").symlink_to("../day2")
+    (tmp_path / "round.png").symlink_to("round.png")
+    assert list_images(tmp_path) == (("a.png", "day2", "gone.png", "round.png"), 0)
+    for name, target in (("gone.png", "moved/a.png"), ("day2", "../day2"), ("round.png", "round.png")):
+        with pytest.raises(InputError) as error:
+            inspect_image(tmp_path, name)
+        assert str(error.value) == (
+            f"image '{name}' is a link to '{target}', where there is no file; set the link again or remove it"
+        )
 
 
 def test_list_of_a_missing_folder(tmp_path):
@@ -88,7 +128,7 @@ def test_truncated_file(tmp_path, suffix):
         inspect_image(tmp_path, path.name)
 
 
-@pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n" + bytes(40)])
+@pytest.mark.parametrize("content", [b"not an image", b"\x89PNG\r\n\x1a\n" + bytes(40)])
 def test_broken_file(tmp_path, content):
     (tmp_path / "a.png").write_bytes(content)
     with pytest.raises(InputError) as error:
@@ -97,6 +137,112 @@ def test_broken_file(tmp_path, content):
         "'a.png' cannot be decoded (not an image of a known format); copy it again from its source, "
         "convert it to JPEG or PNG, or remove it"
     )
+
+
+def test_empty_file(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"")
+    with pytest.raises(InputError) as error:
+        inspect_image(tmp_path, "a.jpg")
+    assert str(error.value) == "'a.jpg' is empty (0 bytes); copy it again from its source, or remove it"
+
+
+@pytest.mark.parametrize("content", ["<!DOCTYPE html>\n<p>404", "\ufeff\n<!-- x --><HTML><p>Sign in"])
+def test_web_page_in_place_of_an_image(tmp_path, content):
+    (tmp_path / "a.jpg").write_text(content, encoding="utf-8")
+    with pytest.raises(InputError) as error:
+        inspect_image(tmp_path, "a.jpg")
+    assert str(error.value) == (
+        "'a.jpg' is a web page and not an image, so its download failed; download it again, or remove it"
+    )
+
+
+def test_too_many_pixels(tmp_path, monkeypatch):
+    PillowImage.new("1", (3000, 1000)).save(tmp_path / "a.png")
+    monkeypatch.setattr(PillowImage, "MAX_IMAGE_PIXELS", 2_000_000)
+    assert inspect_image(tmp_path, "a.png").width == 3000  # Pillow warns, which is not for users
+    monkeypatch.setattr(PillowImage, "MAX_IMAGE_PIXELS", 1_000_000)
+    with pytest.raises(InputError) as error:
+        inspect_image(tmp_path, "a.png")
+    assert str(error.value) == "'a.png' has more than 2 million pixels; make it smaller, or remove it"
+
+
+def test_broken_metadata_is_passed_over_without_a_warning(tmp_path, colours):
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x05\0\x0f\x01"
+    path = save(tmp_path / "a.jpg", colours, exif=exif)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert inspect_image(tmp_path, path.name).width == 40
+        assert read_image(path).shape == (20, 40, 3)
+    assert caught == []
+
+
+def test_formats_that_are_no_photos_are_not_tried(tmp_path, colours):
+    """Pillow would run Ghostscript."""
+    save(tmp_path / "a.eps", colours)
+    (tmp_path / "a.eps").rename(tmp_path / "a.jpg")
+    with pytest.raises(InputError, match=r"^'a\.jpg' cannot be decoded \(not an image of a known format\)"):
+        inspect_image(tmp_path, "a.jpg")
+
+
+@pytest.mark.parametrize("size", [(2, 101), (101, 2)])
+def test_strips_are_refused(tmp_path, size):
+    PillowImage.new("L", size).save(tmp_path / "a.png")
+    with pytest.raises(InputError) as error:
+        inspect_image(tmp_path, "a.png")
+    assert str(error.value) == (
+        f"image 'a.png' is {size[0]}x{size[1]} (width x height), a strip more than 50 times as long as wide; crop it, "
+        "or remove it"
+    )
+    PillowImage.new("L", (2, 100)).save(tmp_path / "a.png")
+    assert inspect_image(tmp_path, "a.png").height == 100
+
+
+def test_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "a.jpg")
+    with pytest.raises(InputError) as error:
+        inspect_image(tmp_path, "a.jpg")
+    assert str(error.value) == "image 'a.jpg' is not a regular file but a folder, pipe or device; remove it"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_image_that_may_not_be_read(tmp_path, colours):
+    save(tmp_path / "a.png", colours).chmod(0)
+    with pytest.raises(InputError) as error:
+        inspect_image(tmp_path, "a.png")
+    assert str(error.value) == (
+        f"image 'a.png' cannot be read from '{tmp_path}' (Permission denied); check its permissions"
+    )
+
+
+@pytest.mark.parametrize(("raw", "shown"), [(b"caf\xe9.png", "caf\\udce9.png"), (b"two\nlines.png", "two\\nlines.png")])
+def test_names_that_no_log_or_database_can_hold(tmp_path, colours, raw, shown):
+    name = os.fsdecode(raw)
+    save(tmp_path / "a.png", colours).rename(tmp_path / name)
+    assert list_images(tmp_path) == ((name,), 0)
+    with pytest.raises(InputError) as error:
+        inspect_image(tmp_path, name)
+    assert str(error.value) == (
+        f"image '{shown}' has a character in its name that cannot be used (a control character, or bytes that are not "
+        "UTF-8); rename it"
+    )
+
+
+def test_names_too_long_for_a_label_map(tmp_path, colours):
+    save(tmp_path / "folder" / ("é" * 113 + ".png"), colours)
+    assert inspect_image(tmp_path, "folder/" + "é" * 113 + ".png").width == 40
+    name = "é" * 114 + ".png"
+    save(tmp_path / name, colours)
+    with pytest.raises(InputError) as error:
+        inspect_image(tmp_path, name)
+    assert str(error.value) == (
+        f"image '{name}' has a file name of 232 bytes; expected at most 230, since its label map gets a longer one: "
+        "rename it"
+    )
+
+
+def test_printable_keeps_every_script():
+    name = "東京\u3000タワー 'x' cafe\u0301 🙂 \\n.jpg"
+    assert printable(name) == name
 
 
 def test_missing_image(tmp_path):
@@ -129,6 +275,52 @@ def test_pixels_of_every_kind_become_rgb(tmp_path):
         pixels = read_image(tmp_path / name)
         assert pixels.dtype == np.uint8
         np.testing.assert_array_equal(pixels, expected, err_msg=name)
+
+
+def _sixteen_bit(pixels: np.ndarray) -> np.ndarray:
+    return pixels.astype(np.uint16) * 257
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("progressive.jpg", "cmyk.jpg", "grey.jpg", "turned.jpg", "turned.png", "turned.tif", "sixteen.png"),
+        *("sixteen.tif", "grey16.png", "grey16.tif", "alpha.png", "moving.png", "pages.tif", "one.png", "one.jpg"),
+        "png.jpg",
+    ],
+)
+def test_geometry_and_pixels_are_those_of_colmap(tmp_path, kind):
+    pixels = np.random.default_rng(0).integers(0, 255, (20, 40, 3)).astype(np.uint8)
+    picture, path = PillowImage.fromarray(pixels), tmp_path / kind
+    frames = {"save_all": True, "append_images": [PillowImage.new("RGB", (40, 20), (200, 0, 0))]}
+    exif = PillowImage.Exif()
+    exif[0x0112] = 6
+    match path.stem:
+        case "progressive":
+            picture.save(path, progressive=True)
+        case "cmyk" | "grey" | "alpha":
+            picture.convert({"cmyk": "CMYK", "grey": "L", "alpha": "RGBA"}[path.stem]).save(path)
+        case "turned":
+            picture.save(path, exif=exif)
+        case "sixteen":
+            assert cv2.imwrite(str(path), _sixteen_bit(pixels))
+        case "grey16":
+            assert cv2.imwrite(str(path), _sixteen_bit(pixels[:, :, 0]))
+        case "moving" | "pages":
+            picture.save(path, **frames)
+        case "one":
+            picture.crop((0, 0, 1, 1)).save(path)
+        case "png":
+            picture.save(path, format="PNG")
+    seen = pycolmap.Bitmap.read(path, True).to_array()
+    np.testing.assert_allclose(read_image(path), seen, atol=2, err_msg="COLMAP reads other pixels")
+    assert inspect_image(tmp_path, kind).width == seen.shape[1]
+
+
+@pytest.mark.parametrize("kind", ["GIF", "WEBP", "JPEG2000"])
+def test_the_format_of_a_file_does_not_follow_from_its_name(tmp_path, colours, kind):
+    save(tmp_path / "a.jpg", colours, format=kind)
+    assert image_format(tmp_path / "a.jpg") == kind
 
 
 def test_black_and_white(tmp_path):

@@ -63,15 +63,95 @@ def test_other_than_two_names_hints_at_tabs(pair_file, line, count):
 
 @pytest.mark.parametrize("content", ["", "# only a comment\n", "a.jpg a.jpg\n"])
 def test_list_without_pairs_is_refused(pair_file, content):
-    with pytest.raises(InputError, match="names no pair of two different images"):
-        read_pairs(pair_file(content), NAMES)
+    path = pair_file(content)
+    with pytest.raises(InputError) as error:
+        read_pairs(path, NAMES)
+    assert str(error.value) == (
+        f"{path} names no pair of two different images; expected lines of the form 'a.jpg b.jpg'"
+    )
 
 
-def test_file_that_cannot_be_read(pair_file, tmp_path):
-    with pytest.raises(InputError, match=r"cannot read the pair list .*missing\.txt: No such file or directory"):
-        read_pairs(tmp_path / "missing.txt", NAMES)
-    with pytest.raises(InputError, match="is not UTF-8 text; save it as UTF-8"):
-        read_pairs(pair_file("a.jpg b.jpg".encode("utf-16")), NAMES)
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("a.jpg b.jpg".encode("utf-16"), "is UTF-16 text, as some Windows programs write it; save it as UTF-8"),
+        ("été.jpg b.jpg".encode("latin-1"), "is not UTF-8 text; save it as UTF-8"),
+        (
+            b"SQLite format 3\0\x10\0",
+            "is not a text file; expected UTF-8 text with lines of the form 'a.jpg b.jpg'",
+        ),
+    ],
+)
+def test_file_of_another_kind(pair_file, content, expected):
+    path = pair_file(content)
+    with pytest.raises(InputError) as error:
+        read_pairs(path, NAMES)
+    assert str(error.value) == f"the pair list {path} {expected}"
+
+
+@pytest.mark.parametrize(("name", "reason"), [("no.txt", "No such file or directory"), (".", "Is a directory")])
+def test_file_that_cannot_be_read(tmp_path, name, reason):
+    with pytest.raises(InputError) as error:
+        read_pairs(tmp_path / name, NAMES)
+    assert str(error.value) == (
+        f"cannot read the pair list {tmp_path / name}: {reason}; give a text file with lines of the form 'a.jpg b.jpg'"
+    )
+
+
+def test_lone_carriage_returns_end_lines(pair_file):
+    assert len(read_pairs(pair_file("a.jpg b.jpg\ra.jpg sub/c.jpg\r"), NAMES).pairs) == 2
+
+
+@pytest.mark.parametrize(
+    ("wrong", "expected"),
+    [
+        (
+            "../x.jpg",
+            "leads out of the image folder; names are relative to that folder; the closest name is 'sub/x.jpg'",
+        ),
+        ("sub\\..\\..\\x.jpg", "leads out of the image folder; names are relative to that folder; the closest name is"),
+        ("/data/x.jpg", "is an absolute path; names are relative to the image folder; the closest name is 'sub/x.jpg'"),
+        ("C:\\x.jpg", "is an absolute path; names are relative to the image folder; the closest name is 'sub/x.jpg'"),
+        ("\\\\host\\x.jpg", "is an absolute path; names are relative to the image folder; the closest name is"),
+        ("sub/../x.jpg", "is not among the 2 images; the closest name is 'sub/x.jpg'"),
+    ],
+)
+def test_names_from_outside_the_image_folder(pair_file, wrong, expected):
+    path = pair_file(f"a.jpg {wrong}\n")
+    with pytest.raises(InputError) as error:
+        read_pairs(path, ("a.jpg", "sub/x.jpg"))
+    assert str(error.value).startswith(f"{path}, line 1: '{wrong}' {expected}")
+
+
+@pytest.mark.parametrize("written", ["sub\\c.jpg", ".\\sub\\c.jpg", "./sub/c.jpg", "sub//c.jpg"])
+def test_other_ways_to_write_a_path_are_understood(pair_file, written):
+    path = pair_file(f"a.jpg {written}\nb.jpg a.jpg\nsub/c.jpg a.jpg\n")
+    assert read_pairs(path, NAMES) == PairList(pairs=(("a.jpg", "sub/c.jpg"), ("b.jpg", "a.jpg")), num_reversed=1)
+
+
+def test_a_backslash_in_the_name_of_a_file_comes_first(pair_file):
+    names = ("a.jpg", "sub/c.jpg", "sub\\c.jpg")
+    assert read_pairs(pair_file("a.jpg sub\\c.jpg\n"), names).pairs == (("a.jpg", "sub\\c.jpg"),)
+
+
+@pytest.mark.parametrize(("name", "shown"), [("x" * 5000, "x" * 117 + "..."), ("\x1b[31ma.jpg", "?[31ma.jpg")])
+def test_what_is_no_name_is_shown_in_short(pair_file, name, shown):
+    path = pair_file(f"a.jpg {name}\n")
+    with pytest.raises(InputError) as error:
+        read_pairs(path, ("a.jpg",))
+    assert str(error.value) == (f"{path}, line 1: '{shown}' is not among the 1 images; the closest name is 'a.jpg'")
+
+
+def test_unicode_forms_are_different_names(pair_file):
+    composed, decomposed = "caf\u00e9.jpg", "cafe\u0301.jpg"
+    path = pair_file(f"{composed} {decomposed}\n")
+    assert read_pairs(path, (composed, decomposed)).pairs == ((composed, decomposed),)
+    with pytest.raises(InputError) as error:
+        read_pairs(path, (composed, "b.jpg"))
+    assert str(error.value) == (
+        f"{path}, line 1: '{decomposed}' is not among the 2 images; '{composed}' looks the same but has other Unicode "
+        "characters (NFC and NFD): copy the name from the folder"
+    )
 
 
 def test_written_pairs_read_back(tmp_path):
