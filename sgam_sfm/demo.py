@@ -8,11 +8,11 @@ from typing import Any
 from rich.console import Console
 
 from sgam_sfm.files import write_json
-from sgam_sfm.images import read_image, read_label_map
 from sgam_sfm.mapping import PoseErrors, compare_poses
 from sgam_sfm.options import MatchOptions
-from sgam_sfm.pictures import draw_areas, write_png
+from sgam_sfm.pictures import pair_picture, save_picture
 from sgam_sfm.progress import Stages
+from sgam_sfm.results import open_results
 from sgam_sfm.runner import match_collection
 from sgam_sfm.scene import demo_views, write_scene
 from sgam_sfm.store import PairRecord, read_pairs_of
@@ -66,19 +66,13 @@ def draw_pairs(options: MatchOptions, folder: Path) -> list[Path]:
             seen = {name for other in chosen for name in other.pair}
             if len(chosen) < _NUM_PICTURES and record not in chosen and (again or not seen & set(record.pair)):
                 chosen.append(record)
-    folder.mkdir(parents=True, exist_ok=True)
-    return [_draw(record, options, folder) for record in chosen]
+    results = open_results(options.output)
+    paths = []
+    for record in chosen:
+        paths.append(folder / f"{'-'.join(Path(name).stem for name in record.pair)}.png")
+        save_picture(pair_picture(results, record.pair), paths[-1])
+    return paths
 
 
 def _kept(record: PairRecord) -> int:
     return 0 if record.result is None else sum(area.state == "kept" for area in record.result.areas)
-
-
-def _draw(record: PairRecord, options: MatchOptions, folder: Path) -> Path:
-    assert record.result is not None
-    pixels0, pixels1 = (read_image(options.images / name) for name in record.pair)
-    labels0, labels1 = (read_label_map(options.output / "labels" / f"{name}.png") for name in record.pair)
-    path = folder / f"{'-'.join(Path(name).stem for name in record.pair)}.png"
-    title = " - ".join(record.pair)
-    write_png(path, draw_areas(pixels0, pixels1, record.result, labels0, labels1, title=title))
-    return path
