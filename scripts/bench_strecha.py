@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sgam_sfm import cli
+from sgam_sfm.exit_codes import DONE
 
 ANGLES = (0.5, 1.0, 3.0)
 
@@ -51,7 +51,7 @@ def run(scene: Path, output: Path, method: str, options: list[str]) -> dict:
     command = [sys.executable, "-m", "sgam_sfm", "match", *files, "--area-matcher", method, *camera, *options]
     code = subprocess.run(command, check=False).returncode  # a process of its own, for its peak memory
     summary = json.loads((output / "summary.json").read_text())
-    model = summary["models"][0] if code == cli.DONE else {}
+    model = summary["models"][0] if code == DONE else {}
     errors = pose_errors(output / "sparse" / "0", scene) if model else np.full(1, 180.0)
     return {
         "exit_code": code,

@@ -17,13 +17,15 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from sgam_core.errors import InputError, OptionError, ShapeError, StageError
-from sgam_sfm.files import replacing
+from sgam_sfm.files import replacing, require_space
 from sgam_sfm.pairs import Pair
 
 logger = logging.getLogger(__name__)
+
+_SMALLEST_DATABASE = 2**20  # bytes, generously
 
 CAMERA_MODELS = tuple(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
 CAMERA_MODES = ("auto", "single", "per-folder", "per-image")
@@ -230,6 +232,94 @@ def read_database(path: Path) -> dict[str, dict]:
         }
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DatabaseCounts:
+    """keypoints: their number by image name. inliers: by verified pair, the image with the smaller id first."""
+
+    keypoints: Mapping[str, int]
+    inliers: Mapping[Pair, int]
+
+
+PairInliers = tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K 2"]]
+"""Keypoints (K, 2) of both images in pixels, a row a match."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class ModelImage:
+    """Keypoints of an image in a model. track_lengths: distinct images that see each one's point, 0 without a point."""
+
+    points: Float[np.ndarray, "N 2"]
+    track_lengths: Int[np.ndarray, " N"]
+
+
+def read_counts(path: Path) -> DatabaseCounts:
+    """How many keypoints every image has, and how many inliers every pair that COLMAP verified.
+
+    Raises: InputError when the file is missing or no COLMAP database.
+    """
+    with _opened(path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        pairs = zip(*database.read_two_view_geometry_num_inliers(), strict=True)
+        ids = ((pycolmap.pair_id_to_image_pair(pair_id), count) for pair_id, count in pairs if count > 0)
+        return DatabaseCounts(
+            keypoints={name: database.num_keypoints_for_image(image_id) for image_id, name in names.items()},
+            inliers={(names[id0], names[id1]): count for (id0, id1), count in ids},
+        )
+
+
+def read_keypoints(path: Path, name: str) -> Float[np.ndarray, "N 2"] | None:
+    """Keypoints (N, 2) of an image, None when the database does not know it.
+
+    Raises: InputError when the file is missing or no COLMAP database.
+    """
+    with _opened(path) as database:
+        image = database.read_image_with_name(name)
+        return None if image is None else np.asarray(database.read_keypoints(image.image_id)[:, :2], np.float64)
+
+
+def read_pair_inliers(path: Path, pair: Pair) -> PairInliers | None:
+    """The keypoints that COLMAP's verification matched in a pair; None when it has not looked at the pair.
+
+    Raises: InputError when the file is missing or no COLMAP database.
+    """
+    with _opened(path) as database:
+        images = [database.read_image_with_name(name) for name in pair]
+        ids = [image.image_id for image in images if image is not None]
+        if len(ids) < 2 or not database.exists_two_view_geometry(*ids):
+            return None
+        indices = np.asarray(database.read_two_view_geometry(*ids).inlier_matches, np.int64).reshape(-1, 2)
+        points = [np.asarray(database.read_keypoints(image_id)[:, :2], np.float64) for image_id in ids]
+        return points[0][indices[:, 0]], points[1][indices[:, 1]]
+
+
+def read_model_names(folder: Path) -> tuple[str, ...]:
+    """The images with a pose in a model, sorted.
+
+    Raises: InputError when the folder holds no COLMAP model.
+    """
+    model = _model(folder)
+    return tuple(sorted(model.image(image_id).name for image_id in model.reg_image_ids()))
+
+
+def read_model_image(folder: Path, name: str) -> ModelImage:
+    """The keypoints of an image with a pose in a model, and the lengths of their tracks.
+
+    Raises: InputError when the folder holds no COLMAP model, or the model no such image.
+    """
+    model = _model(folder)
+    image = model.find_image_with_name(name)
+    if image is None:
+        raise InputError(f"the model in {folder} has no image '{name}'")
+    tracks = [
+        len({element.image_id for element in model.point3D(point.point3D_id).track.elements})
+        if point.has_point3D()
+        else 0
+        for point in image.points2D
+    ]
+    points = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
+    return ModelImage(points=points, track_lengths=np.array(tracks, np.int64))
+
+
 def database_content(path: Path) -> dict[str, dict]:
     """`read_database` with lists in place of arrays: two databases are equal when this is."""
     return _plain(read_database(path))
@@ -265,14 +355,7 @@ def _parameters(model: str, params: str | Sequence[float | str] | None) -> tuple
 
 
 def _model_cameras(folder: Path) -> dict[str, KnownCamera]:
-    try:
-        with _quiet():
-            model = pycolmap.Reconstruction(folder)
-    except (ValueError, RuntimeError) as error:
-        raise InputError(
-            f"{folder} cannot be read as a COLMAP model ({str(error).splitlines()[0]}); it needs cameras, images and "
-            "points3D as .txt or .bin"
-        ) from error
+    model = _model(folder)
     cameras = {
         camera_id: KnownCamera(
             model=camera.model_name,
@@ -283,6 +366,17 @@ def _model_cameras(folder: Path) -> dict[str, KnownCamera]:
         for camera_id, camera in model.cameras.items()
     }
     return {image.name: cameras[image.camera_id] for image in model.images.values()}
+
+
+def _model(folder: Path) -> pycolmap.Reconstruction:
+    try:
+        with _quiet():
+            return pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(
+            f"{folder} cannot be read as a COLMAP model ({str(error).splitlines()[0]}); it needs cameras, images and "
+            "points3D as .txt or .bin"
+        ) from error
 
 
 def _listed_cameras(path: Path) -> dict[str, KnownCamera]:
@@ -421,6 +515,7 @@ def _copy(source: Path, target: Path) -> None:
 @contextmanager
 def _replacing(path: Path) -> Iterator[Path]:
     """A database beside `path` that takes its place, without the journals of either, when all went well."""
+    require_space(path, _SMALLEST_DATABASE)  # COLMAP would not say why it cannot open one
     with replacing(path) as partial:
         try:
             yield partial

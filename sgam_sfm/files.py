@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,3 +30,20 @@ def write_json(path: Path, content: Any) -> None:
     """Dataclasses, paths and plain values as JSON."""
     with replacing(path) as partial:
         partial.write_text(json.dumps(to_jsonable_python(content), indent=2) + "\n", encoding="utf-8")
+
+
+def require_space(path: Path, num_bytes: int) -> None:
+    """Refuse to write a file that the disk has no room for, where what writes it cannot be trusted to fail well.
+
+    Raises: OSError (ENOSPC).
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if shutil.disk_usage(path.parent).free < num_bytes:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
+def disk_is_full(error: BaseException) -> bool:
+    """Whether an error comes from a full disk; libraries that write files tell it in their own words."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return True
+    return any(words in str(error) for words in ("disk is full", "No space left on device", "Disk quota exceeded"))

@@ -1,64 +1,136 @@
-"""Label maps of a collection: made once, kept in OUT/labels at the size that areas are described at."""
+"""Label maps of a collection: made by a segmenter, kept as PNG with a labels.json, read back by image name."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Int32
+from jaxtyping import Bool, Int32
 from PIL import Image as PillowImage
 
 from sgam_core import layout_labels
 from sgam_core.errors import InputError
 from sgam_sfm import registry
+from sgam_sfm.colours import distinct_colour
 from sgam_sfm.files import replacing, write_json
 from sgam_sfm.images import ImageFile, read_label_map
+from sgam_sfm.label_set import RECORD, Label, LabelSet, at_size_of, read_label_set
+from sgam_sfm.machine import find_device
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.progress import Stages
 from sgam_sfm.segmenters.protocol import Segmenter
 
+if TYPE_CHECKING:
+    from sgam_sfm.commands.segment import SegmentOptions
+
+_MAX_LABELS_OF_IMAGE = 1000  # areas are counted label by label
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LabelMaps:
-    """Where the label maps are. failed: images without one, and why. facts: what the segmenter reports of itself."""
+    """The label maps of a collection, as they are on disk."""
 
     folder: Path
-    failed: Mapping[str, str]
-    facts: Mapping[str, object]
+    set: LabelSet
 
     def read(self, name: str) -> Int32[np.ndarray, "H W"]:
         """The label map of an image that is not among the failed."""
         return read_label_map(self.folder / f"{name}.png")
 
+    def mask(self, image: ImageFile, without: Collection[int]) -> Bool[np.ndarray, "H W"] | None:
+        """Where the image (H, W) has none of these labels; None when it has no label map or no label is given."""
+        if not without or image.name in self.set.failed:
+            return None
+        return at_size_of(image, np.isin(self.read(image.name), tuple(without), invert=True).astype(np.uint8)).astype(
+            bool
+        )
+
 
 def make_label_maps(options: MatchOptions, images: Mapping[str, ImageFile], stages: Stages) -> LabelMaps:
-    """Segment the collection, or take what an earlier start of this run has made."""
+    """The label maps of a run in OUT/labels, at the size that areas are described at; made once."""
     folder = options.output / "labels"
-    record = folder / "labels.json"
-    if not record.exists():
-        segmenter: Segmenter = registry.create(
-            "segmenter",
-            "labels" if options.labels else options.segmenter,
-            folder=options.labels,
-            device=options.device,
-            threads=options.threads,
-            seed=options.seed,
-            num_labels=options.num_labels or None,
-            cache_folder=options.output / "cache",
+    if not (folder / RECORD).exists():
+        segmenter = create_segmenter(options, options.output / "cache")
+        name = "labels" if options.labels else options.segmenter
+        write_label_maps(segmenter, name, images, folder, stages, full_size=False)
+    return LabelMaps(folder=folder, set=read_label_set(folder))
+
+
+def create_segmenter(options: MatchOptions | SegmentOptions, cache_folder: Path) -> Segmenter:
+    """The segmenter of the options: a folder of maps when --labels is given."""
+    segmenter: Segmenter = registry.create(
+        "segmenter",
+        "labels" if options.labels else options.segmenter,
+        folder=options.labels,
+        resize=options.resize_labels,
+        device=str(find_device(options.device, "--device")),
+        threads=options.threads,
+        seed=options.seed,
+        num_labels=options.num_labels or None,
+        cache_folder=cache_folder,
+    )
+    return segmenter
+
+
+def write_label_maps(
+    segmenter: Segmenter,
+    name: str,
+    images: Mapping[str, ImageFile],
+    folder: Path,
+    stages: Stages,
+    *,
+    full_size: bool,
+    ignored: str = "",
+) -> LabelSet:
+    """Segment the collection; labels.json, written last, says that it is whole.
+
+    Args: name: of the segmenter. full_size: at the size of the images, else at the size that areas are described at
+        (of which the full size is an exact enlargement, where the image is not smaller). ignored: names or ids.
+    """
+    failed: dict[str, str] = {}
+    pixels: Counter[int] = Counter()
+    with stages.stage("Segmenting images", len(images)) as advance:
+        for file, made in segmenter.segment(tuple(images.values()), advance):
+            if isinstance(made, Exception):
+                failed[file.name] = str(made)
+                continue
+            labels = layout_labels(made)
+            counts = dict(zip(*(part.tolist() for part in np.unique(labels, return_counts=True)), strict=True))
+            if len(counts) > _MAX_LABELS_OF_IMAGE:
+                failed[file.name] = (
+                    f"label map of '{file.name}' has {len(counts)} different ids; expected at most "
+                    f"{_MAX_LABELS_OF_IMAGE}: give ids of kinds of things, not of single pixels or objects"
+                )
+                continue
+            pixels.update(counts)
+            _write_label_map(folder / f"{file.name}.png", file.name, at_size_of(file, made) if full_size else labels)
+    given: LabelSet = getattr(segmenter, "label_set", LabelSet())
+    known = {label.id: label for label in given.labels}
+    total = max(sum(pixels.values()), 1)
+    labels_found = tuple(
+        Label(
+            id=label_id,
+            name=known[label_id].name if label_id in known else "",
+            colour="#{:02x}{:02x}{:02x}".format(*distinct_colour(label_id)),
+            share=round(count / total, 6),
         )
-        failed: dict[str, str] = {}
-        with stages.stage("Segmenting images", len(images)) as advance:
-            for file, labels in segmenter.segment(tuple(images.values()), advance):
-                if isinstance(labels, Exception):
-                    failed[file.name] = str(labels)
-                else:
-                    _write_label_map(folder / f"{file.name}.png", file.name, layout_labels(labels))
-        write_json(record, {"failed": failed, "facts": _facts(segmenter)})
-    content = json.loads(record.read_text(encoding="utf-8"))
-    return LabelMaps(folder=folder, failed=content["failed"], facts=content["facts"])
+        for label_id, count in sorted(pixels.items())
+        if label_id != 0
+    )
+    everything = LabelSet(segmenter=name, labels=(*labels_found, *given.labels))  # names may be absent from the images
+    found = LabelSet(
+        segmenter=name,
+        labels=labels_found,
+        ignored=tuple(sorted({*given.ignored, *everything.ids(ignored, "--ignore-labels")})),
+        failed=failed,
+        facts=_facts(segmenter),
+    )
+    write_json(folder / RECORD, asdict(found))
+    return read_label_set(folder)
 
 
 def _facts(segmenter: Segmenter) -> dict[str, object]:

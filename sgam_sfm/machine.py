@@ -30,6 +30,16 @@ def find_device(name: str, named: str = "device") -> torch.device:
     return device
 
 
+def use_threads(number: int) -> None:
+    """Let torch and OpenCV use this many CPU threads (0: all)."""
+    import cv2
+    import torch
+
+    if number:
+        torch.set_num_threads(number)
+        cv2.setNumThreads(number)
+
+
 def peak_memory_mb() -> float | None:
     """The most memory this process has held, MB; None where the system does not tell (Windows)."""
     status = Path("/proc/self/status")

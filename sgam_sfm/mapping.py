@@ -332,7 +332,8 @@ def _map(job: dict[str, Any], send: Send) -> dict[str, Any]:
     verified = [count for count in counts if count > 0]
     reason = (
         f"COLMAP found no model of at least {options.min_model_size} images from {len(verified)} verified pairs, the "
-        f"best with {max(verified, default=0)} inliers"
+        f"best with {max(verified, default=0)} inliers; try pairs that overlap more (`sgam-sfm show OUT` draws them), "
+        "a larger --image-size, or another --matcher"
     )
     order = sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     summaries = []

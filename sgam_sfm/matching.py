@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -46,17 +46,21 @@ def match_blocks(
 
 
 class CollectionMatcher:
-    """Matches pairs of one collection by name; images are read and described once while they stay in memory."""
+    """Matches pairs of one collection by name; images are read and described once while they stay in memory.
+
+    masked: labels that nothing is matched in.
+    """
 
     def __init__(
         self,
         options: MatchOptions,
         inputs: Inputs,
         labels: LabelMaps | None,
+        masked: Collection[int],
         area_matcher: AreaMatcher,
         point_matcher: PointMatcher,
     ) -> None:
-        self._options, self._inputs, self._labels = options, inputs, labels
+        self._options, self._inputs, self._labels, self._masked = options, inputs, labels, masked
         self._area_matcher, self._point_matcher = area_matcher, point_matcher
         self._image = lru_cache(2 * options.block_images)(self._read_image)  # those of one block
         self._description = lru_cache(_DESCRIPTIONS_IN_MEMORY)(self._describe)
@@ -81,7 +85,7 @@ class CollectionMatcher:
 
     def _match(self, pair: Pair) -> PairResult:
         image0, image1 = (self._image(name) for name in pair)
-        failed = {} if self._labels is None else self._labels.failed
+        failed = {} if self._labels is None or not self._area_matcher.needs_labels else self._labels.set.failed
         reason = next((failed[name] for name in pair if name in failed), "")
         if reason:
             whole = match_described(image0, image1, None, None, WholeImages(), self._point_matcher, self._options.sgam)
@@ -92,6 +96,8 @@ class CollectionMatcher:
     def _read_image(self, name: str) -> Image:
         file = self._inputs.images[name]
         mask = read_mask(self._options.mask_path, file) if self._options.mask_path else None
+        if self._labels is not None and (wanted := self._labels.mask(file, self._masked)) is not None:
+            mask = wanted if mask is None else mask & wanted
         matrix = camera_matrix(self._inputs.cameras[name])
         return Image(name=name, pixels=read_image(file), mask=mask, camera_matrix=matrix)
 

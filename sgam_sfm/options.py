@@ -6,8 +6,9 @@ import difflib
 import hashlib
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_type_hints
 
@@ -61,7 +62,14 @@ class MatchOptions:
     num_labels: int = 0
     """Regions that coseg looks for (0: as many as are stable over seeds)."""
     labels: Path | None = None
-    """Folder of label maps made elsewhere, <name>.png with ids of 8 or 16 bits; wins over --segmenter."""
+    """Folder of label maps, <image name>.png with ids of 8 or 16 bits (made by `sgam-sfm segment` or elsewhere); wins
+    over --segmenter. Its labels.json, when there is one, gives them names."""
+    resize_labels: bool = False
+    """Take label maps of another size than their image, resized to it; otherwise that is an error."""
+    ignore_labels: str = ""
+    """Labels that form no areas, comma-separated names or ids: sky,person,12."""
+    mask_matches: str = ""
+    """Labels that nothing is matched in, comma-separated names or ids: sky,person,12."""
     mask_path: Path | None = None
     """COLMAP's mask folder, <name>.png with 0 where nothing is to be matched."""
 
@@ -112,11 +120,39 @@ class MatchOptions:
         stages = SGAMOptions(**{stage: getattr(self, stage) for stage in _STAGES})
         return replace(stages, geometry=replace(stages.geometry, seed=self.seed))
 
+    def sgam_ignoring(self, labels: Collection[int]) -> SGAMOptions:
+        """The options of the core, with more labels that form no areas."""
+        ignored = tuple(sorted({*self.semantic.ignored_labels, *labels}))
+        return replace(self.sgam, semantic=replace(self.semantic, ignored_labels=ignored))
+
 
 NOT_IN_RESULTS = frozenset(
-    {"output", "config", "threads", "verbose", "refine_intrinsics", "mapper", "mapping", "keypoints"}
+    {"images", "pairs", "cameras", "output", "config", "threads", "verbose"}
+    | {"refine_intrinsics", "mapper", "mapping", "keypoints"}
 )
-"""Options that the raw results of pairs do not follow from: a run can be continued with others."""
+"""Options that the raw results of pairs do not follow from: a run can be continued with others. The images, pairs and
+cameras themselves count, wherever they are."""
+
+VERSION, _FINGERPRINT = "sgam_sfm_version", "fingerprint"
+"""What an options.json holds besides options."""
+
+
+def starting_options(config: Path | None, preset: str | None) -> MatchOptions:
+    """What flags are laid over: the defaults, changed by a preset (that of the file when None), then by a file.
+
+    Raises: OptionError for a file that cannot be used, naming it, or an unknown preset.
+    """
+    content = read_config(config) if config else {}
+    made_by = content.pop(VERSION, version("sgam-sfm"))
+    content.pop(_FINGERPRINT, None)
+    chosen = preset or content.get("preset", "default")
+    options = with_preset(MatchOptions(images=Path(), output=Path()), chosen)
+    try:
+        changed: MatchOptions = merged(options, content | {"preset": chosen})
+        return changed
+    except OptionError as error:
+        other = "" if made_by == version("sgam-sfm") else f"; it was written by sgam-sfm {made_by}, not this version"
+        raise OptionError(f"--config '{config}': {error}{other}") from error
 
 
 def with_preset(options: MatchOptions, preset: str) -> MatchOptions:
@@ -173,9 +209,13 @@ def merged(options: Any, changes: Mapping[str, Any], where: str = "") -> Any:
 
 
 def as_json(options: MatchOptions) -> dict[str, Any]:
-    """The resolved options, as written to options.json and read by --config."""
+    """The resolved options, as written to options.json and read by --config: absolute paths, our version."""
     content: dict[str, Any] = to_jsonable_python(options)
-    return content
+    for option in fields(options):
+        value = getattr(options, option.name)
+        if isinstance(value, Path) and (value.exists() or option.name != "weights"):  # weights may be a name
+            content[option.name] = str(value.absolute())
+    return {VERSION: version("sgam-sfm")} | content
 
 
 def fingerprint(options: MatchOptions, **inputs: Any) -> str:

@@ -27,13 +27,23 @@ def create(kind: str, name: str, **settings: Any) -> Any:
 
     Of `settings` those are passed on that the model's constructor takes, so that a matcher of a few lines needs no
     constructor at all.
-    Raises: OptionError for an unknown name, with the nearest one.
+    Raises: OptionError for an unknown name, with the nearest one, or when a package that it needs is not installed.
     """
     known = available(kind)
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean '{near[0]}'? " if near else ""
         raise OptionError(f"--{kind} '{name}' is unknown; {hint}known: {', '.join(known)}")
-    factory = known[name].load()
-    taken = inspect.signature(factory).parameters
-    return factory(**{key: value for key, value in settings.items() if key in taken})
+    entry = known[name]
+    try:
+        factory = entry.load()
+        taken = inspect.signature(factory).parameters
+        return factory(**{key: value for key, value in settings.items() if key in taken})
+    except ModuleNotFoundError as error:
+        raise OptionError(f"--{kind} '{name}' needs the package '{error.name}'; run `{install(entry)}`") from error
+
+
+def install(entry: EntryPoint) -> str:
+    """The command that brings what a model needs: its package, with the extras that its entry point names."""
+    package = entry.dist.name if entry.dist else entry.module.partition(".")[0]
+    return f"pip install '{package}[{','.join(entry.extras)}]'" if entry.extras else f"pip install '{package}'"

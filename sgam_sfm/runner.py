@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.keypoints import merge_keypoints
 from sgam_sfm.label_maps import make_label_maps
-from sgam_sfm.machine import find_device, peak_memory_mb
+from sgam_sfm.machine import find_device, peak_memory_mb, use_threads
 from sgam_sfm.mapping import (
     MappingOptions,
     MappingSummary,
@@ -29,9 +30,10 @@ from sgam_sfm.mapping import (
     verify,
 )
 from sgam_sfm.matching import CollectionMatcher, match_blocks
-from sgam_sfm.options import NOT_IN_RESULTS, MatchOptions, as_json, fingerprint
+from sgam_sfm.options import NOT_IN_RESULTS, VERSION, MatchOptions, as_json, fingerprint
 from sgam_sfm.pairs import Pair, blocks
 from sgam_sfm.progress import Advance, Stages
+from sgam_sfm.run_record import recording
 from sgam_sfm.store import PairRecord, PairStore
 from sgam_sfm.summary import summarise_images, summarise_keypoints, summarise_pairs, versions
 
@@ -43,9 +45,13 @@ def match_collection(options: MatchOptions, stages: Stages | None = None) -> dic
     Returns: the content of OUT/summary.json.
     Raises: SGAMError for what cannot be used at all. Single images and pairs that fail are counted in the summary.
     """
-    stages = stages or Stages(quiet=True)
+    with recording(options.output, stages := stages or Stages(quiet=True)):
+        return _match_collection(options, stages)
+
+
+def _match_collection(options: MatchOptions, stages: Stages) -> dict[str, Any]:
     options = replace(options, device=str(find_device(options.device, "--device")))
-    _use_threads(options.threads)
+    use_threads(options.threads)
     point_matcher: PointMatcher = registry.create(
         "matcher", options.matcher, weights=options.weights, device=options.device, seed=options.seed
     )
@@ -54,9 +60,14 @@ def match_collection(options: MatchOptions, stages: Stages | None = None) -> dic
 
     inputs = read_inputs(options, stages)
     store = open_store(options, inputs)
-    labels = make_label_maps(options, inputs.images, stages) if area_matcher.needs_labels else None
+    labels, masked = None, tuple[int, ...]()
+    if area_matcher.needs_labels or options.mask_matches:
+        labels = make_label_maps(options, inputs.images, stages)
+        ignored = (*labels.set.ignored, *labels.set.ids(options.ignore_labels, "--ignore-labels"))
+        masked = labels.set.ids(options.mask_matches, "--mask-matches")
+        area_matcher = registry.create("area-matcher", options.area_matcher, options=options.sgam_ignoring(ignored))
     work = blocks(inputs.pairs.pairs, options.block_images)
-    matcher = CollectionMatcher(options, inputs, labels, area_matcher, point_matcher)
+    matcher = CollectionMatcher(options, inputs, labels, masked, area_matcher, point_matcher)
     steps = match_blocks(work, store, matcher, stages)
 
     with stages.stage("Merging keypoints", None):
@@ -72,7 +83,7 @@ def match_collection(options: MatchOptions, stages: Stages | None = None) -> dic
     summary = {
         "images": summarise_images(inputs),
         "pairs": summarise_pairs(inputs, records, verified),
-        "labels": {} if labels is None else {"failed": labels.failed, **labels.facts},
+        "labels": {} if labels is None else {"failed": labels.set.failed, **labels.set.facts},
         "keypoints": summarise_keypoints(merged),
         "models": [] if mapped is None else mapped.models,
         "no_model": "mapping was not asked for (--no-mapping)" if mapped is None else mapped.reason,
@@ -91,22 +102,25 @@ def match_collection(options: MatchOptions, stages: Stages | None = None) -> dic
 
 
 def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
-    """The store of raw results in OUT, bound to options and inputs, which are written to OUT/options.json.
+    """The store of raw results in OUT, bound to options and inputs, which are written to OUT as JSON.
 
     Raises: OptionError when OUT was begun with others, naming them.
     """
-    mark = fingerprint(
-        options, images={name: file.digest for name, file in inputs.images.items()}, pairs=inputs.pairs.pairs
-    )
+    digests = {name: file.digest for name, file in inputs.images.items()}
+    mark = fingerprint(options, images=digests, pairs=inputs.pairs.pairs, cameras=inputs.cameras)
     path = options.output / "options.json"
     now = as_json(options) | {"fingerprint": mark}
     if path.exists():
-        before = json.loads(path.read_text(encoding="utf-8"))
-        if before["fingerprint"] != mark:
+        before = _read_options(path)
+        if before.get("fingerprint") != mark:
             raise OptionError(
                 f"'{options.output}' was begun with other {difference(before, now)}; choose a new --output folder"
             )
     write_json(path, now)
+    write_json(
+        options.output / "inputs.json",
+        {"images": digests, "failed": inputs.failed, "pairs": inputs.pairs.pairs, "left_out": inputs.pairs.unreadable},
+    )
     return PairStore(folder=options.output / "pairs", fingerprint=mark)
 
 
@@ -116,7 +130,15 @@ def difference(before: dict[str, Any], now: dict[str, Any]) -> str:
     changed = [
         f"{flag} ({there.get(flag)} there, {value} here)" for flag, value in here.items() if there.get(flag) != value
     ]
-    return ", ".join(changed) or "images or pairs"
+    return ", ".join(changed) or "images, pairs or cameras"
+
+
+def _read_options(path: Path) -> dict[str, Any]:
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise OptionError(f"'{path}' is damaged ({error}); choose a new --output folder") from error
+    return content
 
 
 def _flags(options: dict[str, Any], prefix: str = "--") -> dict[str, Any]:
@@ -125,7 +147,7 @@ def _flags(options: dict[str, Any], prefix: str = "--") -> dict[str, Any]:
     for name, value in options.items():
         if prefix == "--" and name in NOT_IN_RESULTS | {"fingerprint"}:
             continue
-        flag = prefix + name.replace("_", "-")
+        flag = "version of sgam-sfm" if name == VERSION else prefix + name.replace("_", "-")
         flat |= _flags(value, "--" if name == "crop" else f"{flag}.") if isinstance(value, dict) else {flag: value}
     return flat
 
@@ -176,13 +198,3 @@ def _relative(advance: Advance) -> Callable[[str, int, int], None]:
         shown = done
 
     return progress
-
-
-def _use_threads(number: int) -> None:
-    """Let torch and OpenCV use this many CPU threads (0: all)."""
-    import cv2
-    import torch
-
-    if number:
-        torch.set_num_threads(number)
-        cv2.setNumThreads(number)

@@ -5,6 +5,7 @@ Pixels are (x, y) with corner origin; depth is along the camera's z axis; metres
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from sgam_core.errors import OptionError
 from sgam_core.types import Box
 from sgam_sfm.room import furnished_room
+from sgam_sfm.room.furniture import LABELS
 from sgam_sfm.room.rendering import Rendering, View, looking, render
 from sgam_sfm.room.shapes import lookup
 
@@ -132,7 +134,7 @@ def write_scene(
     min_overlap: float = 0.4,
     advance: Callable[[View], None] = lambda view: None,
 ) -> None:
-    """Render views into a folder: images/, labels/<image>.png (8 bit), ground_truth/ (a COLMAP model) and pairs.txt.
+    """Render views into a folder: images/, labels/ (maps and labels.json), ground_truth/ (a COLMAP model), pairs.txt.
 
     Args: pairs.txt holds the pairs whose images share at least `min_overlap` of what they show (mean of both ways).
         advance(view) is called as soon as a view is written. pairs.txt comes last: with it the folder is complete.
@@ -145,6 +147,7 @@ def write_scene(
             _write_view(folder, view, rendering)
             shown.append((view, rendering))
             advance(view)
+    write_label_names(folder / "labels")
     write_ground_truth(folder / "ground_truth", views)
     pairs = [
         f"{first[0].name} {second[0].name}\n"
@@ -160,6 +163,12 @@ def _write_view(folder: Path, view: View, rendering: Rendering) -> None:
     picture = PIL.Image.fromarray(rendering.pixels)
     picture.save(folder / "images" / view.name, quality=95, subsampling=0, exif=exif)
     PIL.Image.fromarray(rendering.labels.astype(np.uint8)).save(folder / "labels" / f"{view.name}.png")
+
+
+def write_label_names(folder: Path) -> None:
+    """What the ids of the room's label maps mean, as `sgam_sfm.label_set` reads it."""
+    labels = [{"id": label, "name": name} for name, label in LABELS.items()]
+    (folder / "labels.json").write_text(json.dumps({"labels": labels}, indent=2) + "\n")
 
 
 def _mutual_overlap(first: tuple[View, Rendering], second: tuple[View, Rendering]) -> float:

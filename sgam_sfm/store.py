@@ -11,6 +11,7 @@ A block's file appears under its name only when it is whole, so that a block eit
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -66,10 +67,13 @@ class PairStore:
 
     def write(self, block: int, records: Sequence[PairRecord]) -> None:
         """Keep a whole block."""
-        with replacing(self.path(block)) as partial, h5py.File(partial, "w", track_order=True) as file:
+        content = io.BytesIO()  # HDF5 ends the process when it closes a file that the disk has no room for
+        with h5py.File(content, "w", track_order=True) as file:
             file.attrs["fingerprint"] = self.fingerprint
             for index, record in enumerate(records):
                 _write_record(file.create_group(str(index)), record)
+        with replacing(self.path(block)) as partial:
+            partial.write_bytes(content.getbuffer())
 
     def read(self, block: int) -> Iterator[PairRecord]:
         """The records of a block, in its order."""
@@ -134,3 +138,24 @@ def read_pairs_of(output: Path) -> Iterator[PairRecord]:
     """The records of a finished run, from its output folder."""
     for path in sorted((output / "pairs").glob("*.h5")):
         yield from PairStore(folder=path.parent, fingerprint="").read(int(path.stem))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PairOutcome:
+    """How a pair ended, without its matches. error, fallback: empty when there was none."""
+
+    pair: Pair
+    error: str
+    fallback: str
+
+
+def read_pair_outcomes(output: Path) -> Iterator[PairOutcome]:
+    """How the pairs that are done so far ended."""
+    for path in sorted((output / "pairs").glob("*.h5")):
+        with h5py.File(path, "r") as file:
+            for group in file.values():
+                error = str(group.attrs["error"])
+                fallback = "" if error else json.loads(group["facts"][()])["fallback"]
+                yield PairOutcome(
+                    pair=(str(group.attrs["name0"]), str(group.attrs["name1"])), error=error, fallback=fallback
+                )

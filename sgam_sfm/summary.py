@@ -20,7 +20,12 @@ _PACKAGES = ("sgam-sfm", "pycolmap", "torch", "kornia", "numpy", "opencv-python-
 
 def summarise_images(inputs: Inputs) -> dict[str, Any]:
     """Images that the run works on, and those it cannot use."""
-    return {"used": len(inputs.images), "failed": dict(inputs.failed), "other_files": inputs.num_other_files}
+    return {
+        "used": len(inputs.images),
+        "failed": dict(inputs.failed),
+        "other_files": inputs.num_other_files,
+        "same_content": inputs.num_same_content,
+    }
 
 
 def summarise_pairs(inputs: Inputs, records: Iterable[PairRecord], verified: VerificationSummary) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import PIL.Image
 
 from sgam_core import Box, Crop, Image, Matches
 from sgam_sfm.pairs import write_pairs
-from sgam_sfm.scene import Rendering, View, correspond, demo_views, overlap, render
+from sgam_sfm.scene import Rendering, View, correspond, demo_views, overlap, render, write_label_names
 
 WIDTH = 640
 
@@ -89,6 +89,7 @@ def write_room(room: Room, folder: Path) -> Path:
             path = folder / sub / (name if sub == "images" else f"{name}.png")
             path.parent.mkdir(parents=True, exist_ok=True)
             PIL.Image.fromarray(pixels).save(path, quality=95)
+    write_label_names(folder / "labels")
     write_pairs(folder / "pairs.txt", combinations(room.images, 2))
     matrix = next(iter(room.views.values())).camera_matrix
     params = " ".join(f"{value:.6f}" for value in (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))

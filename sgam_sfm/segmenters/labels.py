@@ -10,6 +10,7 @@ from jaxtyping import Int32
 
 from sgam_core.errors import InputError, SGAMError
 from sgam_sfm.images import ImageFile, read_label_map
+from sgam_sfm.label_set import at_size_of, read_label_set
 
 
 class LabelFolder:
@@ -18,13 +19,17 @@ class LabelFolder:
     8 or 16 bits, any ids, 0 = void; the ids mean the same thing in every image (ScanNet, Cityscapes, KITTI-360, or the
     export of any segmentation model).
 
-    Raises: InputError when the folder does not exist.
+    resize: take maps of another size than their image, resized without interpolation. label_set: what the folder's
+    labels.json says of the ids.
+
+    Raises: InputError when the folder does not exist, or its labels.json cannot be used.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, resize: bool = False) -> None:
         if not folder.is_dir():
             raise InputError(f"label folder '{folder}' does not exist; give the folder that holds the label maps")
-        self.folder = folder
+        self.folder, self.resize = folder, resize
+        self.label_set = read_label_set(folder)
 
     def segment(
         self, images: Sequence[ImageFile], advance: Callable[[float], None]
@@ -47,9 +52,10 @@ class LabelFolder:
         if len(found) > 1:
             raise InputError(f"two label maps for '{image.name}': '{found[0]}' and '{found[1]}'; keep one of them")
         labels = read_label_map(self.folder / found[0])
-        if labels.shape != (image.height, image.width):
+        if labels.shape != (image.height, image.width) and not self.resize:
             raise InputError(
                 f"labels for '{image.name}' are {labels.shape[0]}x{labels.shape[1]} but the image is "
-                f"{image.height}x{image.width} (height x width); export them again at the image's size"
+                f"{image.height}x{image.width} (height x width); export them again at the image's size, or pass "
+                "--resize-labels"
             )
-        return labels
+        return at_size_of(image, labels)

@@ -211,7 +211,8 @@ def test_no_model_is_a_result_with_a_reason(tmp_path):
     summary = map_scene(scene, tmp_path / "sparse")
     assert summary.models == ()
     assert summary.reason == (
-        "COLMAP found no model of at least 3 images from 0 verified pairs, the best with 0 inliers"
+        "COLMAP found no model of at least 3 images from 0 verified pairs, the best with 0 inliers; try "
+        "pairs that overlap more (`sgam-sfm show OUT` draws them), a larger --image-size, or another --matcher"
     )
     assert list((tmp_path / "sparse").iterdir()) == []
 

@@ -17,6 +17,7 @@ import pytest
 
 from sgam_sfm import cli
 from sgam_sfm.database import database_content
+from sgam_sfm.exit_codes import DONE, ERROR, SOME_FAILED, USAGE
 from sgam_sfm.mapping import compare_poses
 from sgam_sfm.scene import write_ground_truth
 from tests.room import Room, write_room
@@ -39,7 +40,7 @@ def arguments(folder: Path, output: Path, *more: str) -> list[str]:
 def finished(folder: Path, tmp_path_factory) -> Path:
     """The output of an undisturbed run."""
     output = tmp_path_factory.mktemp("run") / "out"
-    assert cli.run(arguments(folder, output)) == cli.DONE
+    assert cli.run(arguments(folder, output)) == DONE
     return output
 
 
@@ -84,7 +85,7 @@ def test_outputs_are_where_colmap_users_look_for_them(finished):
 def test_started_again_it_does_nothing_anew(folder, finished):
     before = {path: path.stat().st_mtime_ns for path in (finished / "pairs").iterdir()}
     content = database_content(finished / "database.db")
-    assert cli.run(arguments(folder, finished)) == cli.DONE
+    assert cli.run(arguments(folder, finished)) == DONE
     assert before == {path: path.stat().st_mtime_ns for path in (finished / "pairs").iterdir()}
     assert database_content(finished / "database.db") == content
 
@@ -100,12 +101,12 @@ def test_a_killed_run_continues_to_the_same_database(folder, finished, tmp_path,
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not (output / "summary.json").exists()
-    assert cli.run(arguments(folder, output)) == cli.DONE
+    assert cli.run(arguments(folder, output)) == DONE
     assert database_content(output / "database.db") == database_content(finished / "database.db")
 
 
 def test_other_options_need_another_folder(folder, finished, capsys):
-    assert cli.run(arguments(folder, finished, "--area-size", "320")) == cli.USAGE
+    assert cli.run(arguments(folder, finished, "--area-size", "320")) == USAGE
     error = " ".join(capsys.readouterr().err.split())
     assert "was begun with other --area-size (640 there, 320 here)" in error
     assert "choose a new --output folder" in error
@@ -113,7 +114,7 @@ def test_other_options_need_another_folder(folder, finished, capsys):
 
 def test_options_of_a_run_are_a_config_and_flags_win_over_them(folder, finished, tmp_path):
     config = ["--config", str(finished / "options.json"), "--output", str(tmp_path / "out"), "--no-mapping"]
-    assert cli.run(["match", *config, "--area-matcher", "none"]) == cli.DONE
+    assert cli.run(["match", *config, "--area-matcher", "none"]) == DONE
     options = json.loads((tmp_path / "out" / "options.json").read_text())
     assert options["area_matcher"] == "none"
     assert options["block_images"] == 2
@@ -131,7 +132,7 @@ def test_bad_images_and_labels_are_counted_and_lose_nothing_else(room, folder, t
     PIL.Image.new("L", (10, 10)).save(spoilt / "labels" / f"{names[2]}.png")
     (spoilt / "images" / "notes.txt").write_text("a file that is no image")
     output = tmp_path / "out"
-    assert cli.run(arguments(spoilt, output, "--no-mapping")) == cli.SOME_FAILED
+    assert cli.run(arguments(spoilt, output, "--no-mapping")) == SOME_FAILED
     summary = summary_of(output)
     assert list(summary["images"]["failed"]) == [names[0]]
     assert summary["images"]["other_files"] == 1
@@ -151,7 +152,7 @@ def test_masked_ground_has_no_match(room, folder, tmp_path):
         PIL.Image.fromarray(mask).save(masks / f"{name}.png")
     output = tmp_path / "out"
     code = cli.run(arguments(folder, output, "--no-mapping", "--mask-path", str(masks)))
-    assert code == cli.DONE
+    assert code == DONE
     points = np.concatenate([np.array(p) for p in database_content(output / "database.db")["keypoints"].values() if p])
     assert len(points) > 200
     assert points[:, 0].min() > 640 // 2 - 3  # keypoints are means of several points
@@ -182,7 +183,7 @@ def test_wrong_input_is_one_line(folder, tmp_path, capsys, case):
     given = ["match", "--images", str(folder / "images"), "--output", str(tmp_path / "out")]
     given += [change.format(tmp=tmp_path) for change in changes]
     (tmp_path / "empty").mkdir()
-    assert cli.run(given) in (cli.ERROR, cli.USAGE)
+    assert cli.run(given) in (ERROR, USAGE)
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
     assert len(errors) == 1
     assert expected.format(tmp=tmp_path) in errors[0]
@@ -200,13 +201,13 @@ def test_pair_lists_are_checked(folder, tmp_path, capsys, line, expected):
     pairs = tmp_path / "pairs.txt"
     pairs.write_text(line)
     given = ["match", "--images", str(folder / "images"), "--output", str(tmp_path / "out"), "--pairs", str(pairs)]
-    assert cli.run(given) == cli.ERROR
+    assert cli.run(given) == ERROR
     assert expected in capsys.readouterr().err
 
 
 def test_a_missing_flag_is_a_usage_error(capsys):
     with pytest.raises(SystemExit) as ended:
         cli.run(["match", "--images", "photos"])
-    assert ended.value.code == cli.USAGE
+    assert ended.value.code == USAGE
     printed = capsys.readouterr()
     assert "--output" in printed.out + printed.err

@@ -1,0 +1,79 @@
+"""`sgam-sfm status OUT`: what a running or stopped job has done, what failed and why."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.console import Console
+
+from sgam_sfm.exit_codes import DONE
+
+if TYPE_CHECKING:
+    from sgam_sfm.status import RunStatus
+
+_MAX_REASONS = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatusOptions:
+    """What a running or stopped job has done, what failed and why."""
+
+    output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """The --output folder of a run."""
+    json: bool = False
+    """As JSON, with every reason, for programs."""
+
+
+def run(options: StatusOptions, console: Console) -> int:
+    """Print the status."""
+    from sgam_sfm.status import read_status
+
+    status = read_status(options.output)
+    if options.json:
+        print(json.dumps(asdict(status), indent=2))
+    else:
+        for what, text in _lines(status):
+            print(f"{what:<10} {text}")
+    return DONE
+
+
+def _lines(status: RunStatus) -> list[tuple[str, str]]:
+    run = status.run
+    state = f"{run.state} since {run.started}" if run.state == "running" else f"{run.state} at {run.updated}"
+    lines = [("state", f"{state} (process {run.pid} on {run.host})" + (f": {run.error}" if run.error else ""))]
+    if run.state != "done" and run.stage:
+        amount = f" {run.done:.0f} of {run.total:.0f}" if run.total else ""
+        eta = f", about {run.eta_seconds / 60:.0f} min left of this stage" if run.eta_seconds else ""
+        lines.append(("stage", f"{run.stage}{amount}{eta}"))
+    if status.images is not None:
+        lines.append(("images", f"{status.images} used, {len(status.failed_images)} failed"))
+        lines += _reasons(status.failed_images)
+        if status.labels:
+            lines.append(("labels", f"{status.labels} maps"))
+        lines.append(
+            ("pairs", f"{status.pairs_done} of {status.pairs} matched and stored, {len(status.failed_pairs)} failed")
+        )
+        lines += _reasons(status.failed_pairs)
+        if status.fallbacks:
+            told = ", ".join(f"{count} {reason}" for reason, count in status.fallbacks.items())
+            lines.append(("fallbacks", told))
+    if status.summary:
+        for number, model in enumerate(status.summary["models"]):
+            text = f"{model['registered']} of {model['total']} images, {model['points']} points"
+            lines.append((f"model {number}", text))
+        if not status.summary["models"]:
+            lines.append(("model", status.summary["no_model"]))
+    if status.next:
+        lines.append(("next", status.next))
+    return lines
+
+
+def _reasons(failed: dict[str, str]) -> list[tuple[str, str]]:
+    lines = [("", f"{name}: {reason}") for name, reason in list(failed.items())[:_MAX_REASONS]]
+    if len(failed) > _MAX_REASONS:
+        lines.append(("", f"and {len(failed) - _MAX_REASONS} more (--json lists all)"))
+    return lines

@@ -1,0 +1,77 @@
+"""What a running, stopped or finished run has done so far, from its output folder alone."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sgam_core.errors import InputError
+from sgam_sfm.run_record import RunRecord, read_run_record
+from sgam_sfm.store import read_pair_outcomes
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RunStatus:
+    """The state of a run.
+
+    images, pairs: how many there are to work on (None before that is known). failed_images, failed_pairs: and why.
+    labels: images that have a label map. pairs_done: matched, with and without areas. fallbacks: pairs matched without
+    areas, by reason. summary: OUT/summary.json of a finished run. next: the command that goes on from here.
+    """
+
+    run: RunRecord
+    images: int | None
+    failed_images: dict[str, str]
+    labels: int
+    pairs: int | None
+    pairs_done: int
+    failed_pairs: dict[str, str]
+    fallbacks: dict[str, int]
+    summary: dict[str, Any] | None
+    next: str
+
+
+def read_status(output: Path) -> RunStatus:
+    """The status of the run in OUT, while it runs or afterwards.
+
+    Raises: InputError when OUT holds no run.
+    """
+    run = read_run_record(output)
+    if run is None:
+        what = "holds no run of sgam-sfm" if output.is_dir() else "does not exist"
+        raise InputError(f"'{output}' {what}; give the --output folder of `sgam-sfm match`")
+    inputs = _read_json(output / "inputs.json") or {}
+    fallbacks: Counter[str] = Counter()
+    failed: dict[str, str] = {}
+    done = 0
+    for outcome in read_pair_outcomes(output):
+        done += not outcome.error
+        if outcome.error:
+            failed[" - ".join(outcome.pair)] = outcome.error
+        elif outcome.fallback:
+            fallbacks[outcome.fallback.partition(":")[0]] += 1
+    return RunStatus(
+        run=run,
+        images=len(inputs["images"]) if inputs else None,
+        failed_images=inputs.get("failed", {}),
+        labels=sum(1 for _ in (output / "labels").rglob("*.png")),
+        pairs=len(inputs["pairs"]) if inputs else None,
+        pairs_done=done,
+        failed_pairs=failed,
+        fallbacks=dict(sorted(fallbacks.items())),
+        summary=_read_json(output / "summary.json") if run.state == "done" else None,
+        next="" if run.state in ("running", "done") else f"sgam-sfm match --config '{output / 'options.json'}'",
+    )
+
+
+def _read_json(path: Path) -> dict[str, Any] | None:
+    if not path.exists():
+        return None
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"'{path}' is damaged ({error}); start the run again") from error
+    return content
