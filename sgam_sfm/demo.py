@@ -10,7 +10,7 @@ from rich.console import Console
 from sgam_sfm.files import write_json
 from sgam_sfm.mapping import PoseErrors, compare_poses
 from sgam_sfm.options import MatchOptions
-from sgam_sfm.pictures import pair_picture, save_picture
+from sgam_sfm.pictures import collection_picture, pair_picture, save_picture
 from sgam_sfm.progress import Stages
 from sgam_sfm.results import open_results
 from sgam_sfm.runner import match_collection
@@ -39,7 +39,7 @@ def run_demo(output: Path, device: str, threads: int, console: Console) -> tuple
     )
     summary = match_collection(options, stages)
     print_summary(summary, console)
-    for picture in draw_pairs(options, output / "pictures"):
+    for picture in draw_pictures(options, output / "pictures"):
         console.print(f"picture    {picture}", highlight=False, soft_wrap=True)
     if summary["models"]:
         errors = compare_poses(options.output / "sparse" / "0", scene / "ground_truth")
@@ -56,8 +56,8 @@ def _truth(errors: PoseErrors) -> str:
     )
 
 
-def draw_pairs(options: MatchOptions, folder: Path) -> list[Path]:
-    """Pictures of the pairs that show most: those with most areas kept, no image twice where it can be helped."""
+def draw_pictures(options: MatchOptions, folder: Path) -> list[Path]:
+    """Pictures of the collection and of the pairs with most areas kept, no image twice where it can be helped."""
     records = [record for record in read_pairs_of(options.output) if record.result is not None]
     records.sort(key=lambda record: (-_kept(record), record.pair))
     chosen: list[PairRecord] = []
@@ -67,11 +67,12 @@ def draw_pairs(options: MatchOptions, folder: Path) -> list[Path]:
             if len(chosen) < _NUM_PICTURES and record not in chosen and (again or not seen & set(record.pair)):
                 chosen.append(record)
     results = open_results(options.output)
-    paths = []
-    for record in chosen:
-        paths.append(folder / f"{'-'.join(Path(name).stem for name in record.pair)}.png")
-        save_picture(pair_picture(results, record.pair), paths[-1])
-    return paths
+    figures = {"collection": collection_picture(results)}
+    for pair in (record.pair for record in chosen):
+        figures["-".join(Path(name).stem for name in pair)] = pair_picture(results, pair)
+    for name, figure in figures.items():
+        save_picture(figure, folder / f"{name}.png")
+    return [folder / f"{name}.png" for name in figures]
 
 
 def _kept(record: PairRecord) -> int:

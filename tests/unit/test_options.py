@@ -1,0 +1,74 @@
+"""Options from files: misspelt, of another type, of another version; what options.json holds."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sgam_core.errors import OptionError
+from sgam_sfm.options import VERSION, MatchOptions, as_json, fingerprint, starting_options
+
+
+def written(tmp_path: Path, content: object, name: str = "c.json") -> Path:
+    path = tmp_path / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ({"matchr": "loftr"}, "option 'matchr' is unknown; did you mean 'matcher'?"),
+        ({"crop": {"area_sise": 3}}, "option 'crop.area_sise' is unknown; did you mean 'crop.area_size'?"),
+        ({"zzz": 1}, "option 'zzz' is unknown"),
+        ({"seed": "many"}, "option 'seed' is 'many': Input should be a valid integer, unable to parse string as an"),
+        ({"mapping": [1]}, "option 'mapping' is [1]: Input should be a valid boolean"),
+        ({"mapper": "colmap"}, "option 'mapper' is 'colmap': Input should be 'incremental' or 'global'"),
+        ({"preset": "papr"}, "preset 'papr' is unknown; known: default, paper"),
+        ([1, 2], "holds a list; expected options by name"),
+        ("{", "cannot be used ("),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_named_with_what_is_wrong(tmp_path, content, expected):
+    path = written(tmp_path, content)
+    with pytest.raises(OptionError) as error:
+        starting_options(path, None)
+    assert str(error.value).startswith(f"--config '{path}'")
+    assert expected in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_of_another_version_says_so_when_it_does_not_fit(tmp_path):
+    path = written(tmp_path, {VERSION: "9.0", "hologram": True})
+    with pytest.raises(OptionError) as error:
+        starting_options(path, None)
+    assert str(error.value) == (
+        f"--config '{path}': option 'hologram' is unknown; it was written by sgam-sfm 9.0, not this version"
+    )
+    assert starting_options(written(tmp_path, {VERSION: "9.0", "seed": 3}), None).seed == 3
+
+
+def test_toml_with_dashes_and_a_preset_below_it(tmp_path):
+    path = written(tmp_path, 'preset = "scannet"\nblock-images = 4\n[crop]\narea-size = 320\n', "c.toml")
+    options = starting_options(path, None)
+    assert (options.preset, options.block_images, options.crop.area_size) == ("scannet", 4, 320)
+    assert options.collection.min_coverage == 0.6
+    assert starting_options(path, "paper").collection.min_coverage == 0.3
+
+
+def test_written_options_read_back_and_have_absolute_paths(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    options = MatchOptions(images=Path("photos"), output=Path("out"), weights=Path("outdoor"), seed=5)
+    content = as_json(options)
+    assert content["images"] == str(tmp_path / "photos")
+    assert content["weights"] == "outdoor"  # a name, since there is no such file
+    read = starting_options(written(tmp_path, content | {"fingerprint": "x"}), None)
+    assert as_json(read) == content
+
+
+def test_results_follow_from_images_not_from_where_they_are(tmp_path):
+    here = MatchOptions(images=Path("a"), output=Path("out"), verbose=True)
+    there = MatchOptions(images=Path("b"), output=Path("other"), threads=3)
+    assert fingerprint(here, images={"x": "1"}) == fingerprint(there, images={"x": "1"})
+    assert fingerprint(here, images={"x": "1"}) != fingerprint(here, images={"x": "2"})
+    assert fingerprint(here) != fingerprint(MatchOptions(images=Path("a"), output=Path("out"), seed=1))
