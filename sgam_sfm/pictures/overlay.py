@@ -11,7 +11,6 @@ import PIL.ImageDraw
 import PIL.ImageFont
 from jaxtyping import Int32, UInt8
 
-from sgam_sfm.colours import distinct_colour
 from sgam_sfm.pictures.canvas import limited, resized, tinted
 
 _MIN_SHARE = 0.004  # of the picture: smaller regions have no number
@@ -25,7 +24,7 @@ def draw_labels(
     small = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT)
     picture = PIL.Image.fromarray(tinted(resized(pixels, size), small, strength=0.4))
     draw = PIL.ImageDraw.Draw(picture)
-    font = PIL.ImageFont.load_default(size=max(long_side // 60, 12))
+    font = PIL.ImageFont.load_default(size=max(long_side // 50, 12))
     for label in np.unique(small):
         region = (small == label).astype(np.uint8)
         if label == 0 or region.mean() < _MIN_SHARE:
