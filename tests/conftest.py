@@ -8,9 +8,8 @@ from pathlib import Path
 import jaxtyping
 import pytest
 
+from tests.paths import DATA
 from tests.room import Room, small_room
-
-DATA = Path(os.environ.get("SGAM_SFM_DATA", Path(__file__).parents[1] / "../shared/data"))
 
 
 @pytest.fixture(scope="session")

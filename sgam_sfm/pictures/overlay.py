@@ -32,7 +32,5 @@ def draw_labels(
         inside = cv2.distanceTransform(cv2.copyMakeBorder(region, 1, 1, 1, 1, cv2.BORDER_CONSTANT), cv2.DIST_L2, 5)
         y, x = np.unravel_index(inside.argmax(), inside.shape)
         text = f"{label} {names.get(int(label), '')}".strip()
-        draw.text(
-            (int(x), int(y)), text, distinct_colour(int(label)), font, "mm", stroke_width=3, stroke_fill=(0, 0, 0)
-        )
+        draw.text((int(x), int(y)), text, "white", font, "mm", stroke_width=2, stroke_fill="black")
     return np.asarray(picture)

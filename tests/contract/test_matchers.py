@@ -1,8 +1,6 @@
 """What every registered point matcher must do, whatever it is made of."""
 
-import os
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,25 +8,16 @@ import pytest
 from sgam_core.errors import WeightsError
 from sgam_core.types import Box, Crop, Matches
 from sgam_sfm.registry import available, create
+from tests.paths import weights_of
 from tests.textures import similarity, transfer, view, whole
 
-WEIGHTS = Path(os.environ.get("SGAM_SFM_WEIGHTS", Path(__file__).parents[2] / "../shared/weights"))
-FILES = {"coarse-loftr": "coarse_loftr_teacher.onnx"}  # those that no installed package carries
 SIZE = (320, 240)
 WARP = similarity(1.1, 6, (7.3, -4.6), (160, 120))
 
 
-def _file(name: str) -> Path | None:
-    """The file that a test run was given for a matcher; None leaves it to the matcher to find its own."""
-    if name == "loftr" and "SGAM_SFM_LOFTR_WEIGHTS" in os.environ:
-        return Path(os.environ["SGAM_SFM_LOFTR_WEIGHTS"])
-    file = WEIGHTS / FILES[name] if name in FILES else None
-    return file if file is not None and file.is_file() else None
-
-
 @cache
 def _made(name: str):
-    return create("matcher", name, weights=_file(name))
+    return create("matcher", name, weights=weights_of(name))
 
 
 @pytest.fixture(params=list(available("matcher")))
@@ -36,8 +25,7 @@ def matcher(request):
     try:
         made = _made(request.param)
     except WeightsError as error:
-        folder = f"SGAM_SFM_WEIGHTS to the folder of {FILES.get(request.param)}"
-        variable = "SGAM_SFM_LOFTR_WEIGHTS" if request.param == "loftr" else folder
+        variable = "SGAM_SFM_LOFTR_WEIGHTS" if request.param == "loftr" else "SGAM_SFM_WEIGHTS"
         pytest.skip(f"{request.param}: {error}; or set {variable}")
     if hasattr(made, "reset"):
         made.reset()

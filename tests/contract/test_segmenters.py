@@ -12,6 +12,7 @@ from PIL import Image as PillowImage
 from sgam_core.errors import InputError, WeightsError
 from sgam_sfm.images import ImageFile, inspect_image
 from sgam_sfm.segmenters.protocol import Segmenter
+from tests.paths import weights_of
 
 SEGMENTERS = sorted(point.name for point in entry_points(group="sgam_sfm.segmenters"))
 QUICK: dict[str, dict[str, Any]] = {"coseg": {"image_size": 224, "num_labels": 6}}
@@ -46,6 +47,8 @@ def segmenter(request, folder) -> Segmenter:
     options = {**QUICK.get(request.param, {})}
     if "folder" in inspect.signature(segmenter_class).parameters:
         options["folder"] = folder / "labels"
+    if (weights := weights_of(request.param)) is not None:
+        options["weights"] = weights
     try:
         return segmenter_class(**options)
     except (TypeError, WeightsError) as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from pathlib import Path
 
@@ -25,9 +24,8 @@ from sgam_sfm.progress import Stages
 from sgam_sfm.room.furniture import LABELS
 from sgam_sfm.segmenters.ade20k import CLASSES
 from sgam_sfm.store import read_pairs_of
+from tests.paths import weights_of
 from tests.room import Room, write_room
-
-WEIGHTS = Path(os.environ.get("SGAM_SFM_WEIGHTS", Path(__file__).parents[2] / "../shared/weights"))
 
 
 @pytest.fixture(scope="module")
@@ -165,15 +163,13 @@ def test_a_damaged_labels_json_is_named(folder, tmp_path, capsys):
 def test_ade20k_names_what_photos_show(data, tmp_path):
     """Provenance: castle-P19/0000.jpg is a courtyard, two thirds building, a sixth sky, a fifth ground."""
     try:
-        file = WEIGHTS / "deeplabv3_mnv2_ade20k_uint8.tflite"
-        registry.create("segmenter", "ade20k", weights=file)
+        segmenter = registry.create("segmenter", "ade20k", weights=weights_of("ade20k"))
     except WeightsError as error:
         pytest.skip(f"{error}; or set SGAM_SFM_WEIGHTS")
     images = tmp_path / "images"
     images.mkdir()
     (images / "a.jpg").symlink_to((data / "strecha" / "castle-P19" / "images" / "0000.jpg").resolve())
     files = read_images(images, tmp_path / "none", Stages(quiet=True)).images
-    segmenter = registry.create("segmenter", "ade20k", weights=file)
     ((_, labels),) = segmenter.segment(tuple(files.values()), lambda share: None)
     share = {name: (labels == number).mean() for number, name in enumerate(CLASSES, start=1)}
     assert share["building"] > 0.5

@@ -3,15 +3,15 @@ import pytest
 
 from sgam_core.types import Crop
 from sgam_sfm.matchers.coarse_loftr import _CENTERS, CoarseLoFTR, _expected, _mutual_best, _view
-from tests.contract.test_matchers import FILES, WEIGHTS
+from tests.paths import WEIGHTS, weights_of
 from tests.textures import similarity, transfer, view, whole
 
 
 @pytest.fixture(scope="module")
 def matcher():
-    path = WEIGHTS / FILES["coarse-loftr"]
-    if not path.is_file():
-        pytest.skip(f"no model at '{path}'; set SGAM_SFM_WEIGHTS to the folder of {path.name}")
+    path = weights_of("coarse-loftr")
+    if path is None:
+        pytest.skip(f"no coarse LoFTR in '{WEIGHTS}'; set SGAM_SFM_WEIGHTS")
     return CoarseLoFTR(weights=path, threads=1)
 
 
