@@ -19,7 +19,7 @@ from sgam_core.prediction import MatchedArea, predict
 from sgam_core.protocols import AreaMatcher, PointMatcher
 from sgam_core.rejection import reject
 from sgam_core.semantic import SemanticAreaMatcher
-from sgam_core.types import AreaMatch, AreaState, Crop, Image, Matches, PairResult, PutativeAreas
+from sgam_core.types import AreaMatch, AreaState, Box, Crop, Image, Matches, PairResult, PutativeAreas
 
 
 def match_pair(
@@ -63,8 +63,11 @@ def match_described(
     point_matcher: PointMatcher,
     options: SGAMOptions,
 ) -> PairResult:
-    """The whole algorithm for two images whose areas have been described: SAM, PM, GP, GR, GMC."""
-    points = _Points(image0, image1, point_matcher, options.crop)
+    """The whole algorithm for two images whose areas have been described: SAM, PM, GP, GR, GMC.
+
+    Crops are those of `area_crop`, unless the area matcher has a method `crop(image, box, options)` of its own.
+    """
+    points = _Points(image0, image1, point_matcher, options.crop, getattr(area_matcher, "crop", area_crop))
     estimate = partial(
         estimate_two_view, camera0=image0.camera_matrix, camera1=image1.camera_matrix, options=options.geometry
     )
@@ -110,6 +113,11 @@ def match_described(
     )
 
 
+def match_whole(image0: Image, image1: Image, point_matcher: PointMatcher, options: CropOptions) -> Matches:
+    """Plain matches of two whole images, in image pixels."""
+    return _Points(image0, image1, point_matcher, options, area_crop).whole()
+
+
 class WholeImages:
     """The area matcher `none`: proposes no area, so that the point matcher sees whole images. The baseline."""
 
@@ -133,8 +141,15 @@ def _final(area: MatchedArea, fallback: str) -> MatchedArea:
 class _Points:
     """The point matcher's calls for one pair: whole images at most once, areas in one batch."""
 
-    def __init__(self, image0: Image, image1: Image, matcher: PointMatcher, options: CropOptions) -> None:
-        self.images, self.matcher, self.options = (image0, image1), matcher, options
+    def __init__(
+        self,
+        image0: Image,
+        image1: Image,
+        matcher: PointMatcher,
+        options: CropOptions,
+        area_crop: Callable[[Image, Box, CropOptions], Crop],
+    ) -> None:
+        self.images, self.matcher, self.options, self.area_crop = (image0, image1), matcher, options, area_crop
         self.pixels = 0
         self.seconds = 0.0
         self.notes: tuple[str, ...] = ()
@@ -155,10 +170,8 @@ class _Points:
         """Point matches inside all confident areas and the doubtful candidates that the limits allow."""
         limited = _limit_candidates(putative.doubtful, max_candidates)
         planned = [*putative.confident, *(candidate for group in limited for candidate in group)]
-        crops = [
-            (area_crop(self.images[0], a.area0.box, self.options), area_crop(self.images[1], a.area1.box, self.options))
-            for a in planned
-        ]
+        (image0, image1), crop, options = self.images, self.area_crop, self.options
+        crops = [(crop(image0, a.area0.box, options), crop(image1, a.area1.box, options)) for a in planned]
         chosen = self._within_budget(planned, crops)
         found = dict(zip(chosen, self._match([crops[k] for k in chosen]), strict=True))
         areas = iter([self._matched(area, crops[k], found.get(k)) for k, area in enumerate(planned)])

@@ -22,6 +22,19 @@ def area_crop(image: Image, box: Box, options: CropOptions) -> Crop:
     return _crop(image, Box(x0=x0, y0=y0, x1=x1, y1=y1), options.area_size, upsample=options.upsample)
 
 
+def box_crop(image: Image, box: Box, long_side: int, *, upsample: bool) -> Crop:
+    """The box itself, out to whole pixels of the image, its long side at most `long_side` (with upsample: exactly)."""
+    x0, x1 = whole_pixels(box.x0, box.x1, image.width)
+    y0, y1 = whole_pixels(box.y0, box.y1, image.height)
+    return _crop(image, Box(x0=x0, y0=y0, x1=x1, y1=y1), long_side, upsample=upsample)
+
+
+def whole_pixels(start: float, stop: float, length: int) -> tuple[int, int]:
+    """The whole pixels [first, last) that [start, stop) touches, at least one, inside [0, length)."""
+    first = min(max(math.floor(start), 0), length - 1)
+    return first, max(min(math.ceil(stop), length), first + 1)
+
+
 def _window(center: float, side: float, length: int) -> tuple[int, int]:
     """Whole pixels [start, stop) of about `side`, centred where possible, inside [0, length)."""
     extent = min(max(round(side), 1), length)

@@ -30,6 +30,10 @@ class _Checked:
             if isinstance(value, int | float) and value < 0:
                 raise OptionError(f"{option.name} is {value}; expected a number of at least 0")
 
+    def _within(self, name: str, low: float, high: float) -> None:
+        if not low <= (value := getattr(self, name)) <= high:
+            raise OptionError(f"{name} is {value}; expected a number from {low} to {high}")
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class CropOptions(_Checked):
@@ -124,6 +128,48 @@ class SemanticOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class TileOptions(_Checked):
+    """Tiles: a grid, paired by a first match of the whole images; no labels."""
+
+    side_share: float = 0.4
+    """Side of a tile, share of its image's long side, 0.05 to 1; its resolution at the matcher is area_size over it."""
+    overlap_share: float = 0.1
+    """Neighbouring tiles overlap by at least this share of their side (0: they touch; at most 0.9)."""
+    min_matches: int = 10
+    """Two tiles become a pair when at least this many whole-image matches join them (0: one is enough)."""
+    max_pairs: int = 8
+    """Most tile pairs per image pair, those with most matches first (0: no limit)."""
+    verify: bool = True
+    """Count only matches that agree with one robust geometry of the pair, where there is one (False: all)."""
+
+    def __post_init__(self) -> None:
+        _Checked.__post_init__(self)
+        self._within("side_share", 0.05, 1)
+        self._within("overlap_share", 0, 0.9)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CovisibleOptions(_Checked):
+    """Covisible: one area an image, where a first match of the whole images lies; no labels.
+
+    Its crop has image_size, not area_size: it replaces the whole image.
+    """
+
+    min_matches: int = 20
+    """Fewest whole-image matches for an area (0: one is enough)."""
+    quantile: float = 0.02
+    """Share of the matches, weighted by score, left out at each side of the box (0: none; at most 0.45)."""
+    margin: float = 0.1
+    """Added on each side of the box, share of its long side (0: nothing)."""
+    verify: bool = True
+    """Enclose only matches that agree with one robust geometry of the pair, where there is one (False: all)."""
+
+    def __post_init__(self) -> None:
+        _Checked.__post_init__(self)
+        self._within("quantile", 0, 0.45)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class GeometryOptions(_Checked):
     """Robust epipolar geometry of a pair."""
 
@@ -201,6 +247,10 @@ class SGAMOptions(_Checked):
     """Crops for the point matcher."""
     semantic: SemanticOptions = field(default_factory=SemanticOptions)
     """SAM."""
+    tiles: TileOptions = field(default_factory=TileOptions)
+    """The area matcher `tiles`."""
+    covisible: CovisibleOptions = field(default_factory=CovisibleOptions)
+    """The area matcher `covisible`."""
     geometry: GeometryOptions = field(default_factory=GeometryOptions)
     """Robust estimation."""
     prediction: PredictionOptions = field(default_factory=PredictionOptions)

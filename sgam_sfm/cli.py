@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import errno
+import os
 import sys
 from collections.abc import Sequence
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,24 +17,33 @@ from rich.console import Console
 from rich.markup import escape
 
 from sgam_core.errors import OptionError, SGAMError
+from sgam_sfm.commands.compare import CompareOptions
 from sgam_sfm.commands.demo import DemoOptions
 from sgam_sfm.commands.doctor import DoctorOptions
+from sgam_sfm.commands.evaluate import EvaluateOptions
 from sgam_sfm.commands.models import ModelsOptions
 from sgam_sfm.commands.segment import SegmentOptions
 from sgam_sfm.commands.show import ShowOptions
 from sgam_sfm.commands.status import StatusOptions
-from sgam_sfm.exit_codes import ERROR, INTERRUPTED, MEANINGS, USAGE
+from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED, MEANINGS, USAGE
 from sgam_sfm.files import disk_is_full
 from sgam_sfm.options import MatchOptions, starting_options
 
 _COMMANDS = {
     MatchOptions: "match",
+    CompareOptions: "compare",
+    EvaluateOptions: "evaluate",
     SegmentOptions: "segment",
     ShowOptions: "show",
     StatusOptions: "status",
     ModelsOptions: "models",
     DoctorOptions: "doctor",
     DemoOptions: "demo",
+}
+# Commands that take the options of `match` too: what they need besides, and the empty value of each.
+_NEEDED: dict[type, dict[str, Any]] = {
+    CompareOptions: {"methods": ()},
+    EvaluateOptions: {"ground_truth": Path()},
 }
 # What a folder can refuse; every other OSError would be a mistake of ours, and shows its traceback.
 _REFUSALS = {
@@ -56,6 +67,9 @@ def run(arguments: Sequence[str]) -> int:
         options = _parse(arguments)
         command = import_module(f"sgam_sfm.commands.{_COMMANDS[type(options)]}")
         return int(command.run(options, console))
+    except BrokenPipeError:  # `sgam-sfm models | head -1` has read what it wanted
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
     except Exception as error:
         message, code = _explained(error)
         console.print(f"[red]error:[/red] {escape(message)}", highlight=False, soft_wrap=True)
@@ -66,9 +80,11 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _parse(arguments: Sequence[str]) -> Any:
-    commands: Any = Annotated[MatchOptions, tyro.conf.subcommand("match", default=_match_defaults(arguments))]
+    commands: Any = Annotated[MatchOptions, tyro.conf.subcommand("match", default=_defaults(arguments, MatchOptions))]
     for options, name in _COMMANDS.items():
-        if options is not MatchOptions:
+        if options in _NEEDED:
+            commands |= Annotated[options, tyro.conf.subcommand(name, default=_defaults(arguments, options))]
+        elif options is not MatchOptions:
             commands |= Annotated[options, tyro.conf.subcommand(name)]
     return tyro.cli(
         Annotated[commands, tyro.conf.OmitSubcommandPrefixes],
@@ -78,17 +94,20 @@ def _parse(arguments: Sequence[str]) -> Any:
     )
 
 
-def _match_defaults(arguments: Sequence[str]) -> Any:
-    """The values that flags of `match` are laid over: the preset's, then the file's."""
+def _defaults(arguments: Sequence[str], command: type[MatchOptions]) -> Any:
+    """The values that flags of `match` or `compare` are laid over: the preset's, then the file's."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--config", type=Path)
     early.add_argument("--preset")
-    known, _ = early.parse_known_args(arguments if arguments[:1] == ["match"] else [])
-    options = starting_options(known.config, known.preset)
-    for name in ("images", "output"):
-        if getattr(options, name) == Path():
-            object.__setattr__(options, name, tyro.MISSING)  # no Path: tells tyro that the flag is required
-    return options
+    known, _ = early.parse_known_args(arguments if arguments[:1] == [_COMMANDS[command]] else [])
+    start = starting_options(known.config, known.preset)
+    values: dict[str, Any] = {option.name: getattr(start, option.name) for option in fields(start)}
+    needed = {"images": Path(), "output": Path()} | _NEEDED.get(command, {})
+    made = command(**(needed | values))
+    for name, empty in needed.items():
+        if getattr(made, name) == empty:
+            object.__setattr__(made, name, tyro.MISSING)  # of no option's type: tells tyro that the flag is required
+    return made
 
 
 def _explained(error: Exception) -> tuple[str, int]:

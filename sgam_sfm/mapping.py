@@ -19,7 +19,8 @@ import sys
 import threading
 import time
 import zlib  # noqa: F401  (before pycolmap, whose wheel carries a zlib of its own: loaded later, ours would mix the two)
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -92,7 +93,8 @@ class ModelSummary:
     """One reconstruction.
 
     folder: its name under the output folder. registered: images with a pose, of the `total` in the database.
-    mean_images_per_track: distinct images that see a point, however often each does.
+    mean_images_per_track: distinct images that see a point, however often each does. images_per_track: how many points
+    (values) are seen by how many images (keys).
     """
 
     folder: str
@@ -101,6 +103,7 @@ class ModelSummary:
     points: int
     observations: int
     mean_images_per_track: float
+    images_per_track: Mapping[int, int]
     mean_reprojection_error_px: float
     images: tuple[str, ...]
 
@@ -148,6 +151,36 @@ def verify(
     )
 
 
+def match_sift(
+    database_path: Path,
+    image_folder: Path,
+    pairs: Sequence[Pair],
+    options: VerificationOptions | None = None,
+    on_progress: Progress | None = None,
+    log_path: Path | None = None,
+) -> float:
+    """COLMAP's own SIFT features and matches of the pairs, into a database whose images and cameras are imported.
+
+    Returns: the seconds it took. Features and matcher have COLMAP's defaults; `verify` comes afterwards, as after any
+        other matches.
+    Raises: StageError when COLMAP fails or ends its process; InputError for names that its pair list cannot hold.
+    """
+    _require(database_path)
+    pair_list = database_path.with_name("sift_pairs.txt")
+    spaced = [name for pair in pairs for name in pair if len(name.split()) > 1]
+    if spaced:
+        raise InputError(f"image name '{spaced[0]}' has a space, which COLMAP's pair list cannot hold; leave out sift")
+    pair_list.write_text("".join(f"{name0} {name1}\n" for name0, name1 in pairs), encoding="utf-8")
+    job = {
+        "stage": "SIFT",
+        "database": str(database_path),
+        "images": str(image_folder),
+        "pairs": str(pair_list),
+        "options": asdict(options or VerificationOptions()),
+    }
+    return _run(job, log_path or database_path.parent / "colmap.log", on_progress)[1]
+
+
 def map_images(
     database_path: Path,
     image_folder: Path,
@@ -185,7 +218,7 @@ def map_images(
     try:
         partial.mkdir(parents=True, exist_ok=True)
         result, seconds = _run(job, log_path or database_path.parent / "colmap.log", on_progress)
-        models = tuple(ModelSummary(**{**model, "images": tuple(model["images"])}) for model in result["models"])
+        models = tuple(_model_summary(model) for model in result["models"])
         output_sparse.mkdir(exist_ok=True)
         for old in output_sparse.iterdir():
             if old.name.isdecimal():
@@ -216,6 +249,12 @@ def compare_poses(model: Path, truth: Path, max_center_error: float = 0.1) -> Po
         median_rotation_deg=median(rotations),
         max_rotation_deg=max(rotations),
     )
+
+
+def _model_summary(model: dict[str, Any]) -> ModelSummary:
+    """From JSON, which knows neither tuples nor numbers as keys."""
+    lengths = {int(length): count for length, count in model["images_per_track"].items()}
+    return ModelSummary(**{**model, "images": tuple(model["images"]), "images_per_track": lengths})
 
 
 def _require(database_path: Path) -> None:
@@ -311,6 +350,30 @@ def _verify(job: dict[str, Any], send: Send) -> dict[str, Any]:
         "inliers": [[names[id0], names[id1], count] for id0, id1, count in sorted(pairs) if count > 0],
         "num_pairs": num_pairs,
     }
+
+
+def _sift(job: dict[str, Any], send: Send) -> dict[str, Any]:
+    import pycolmap
+
+    options = VerificationOptions(**job["options"])
+    with pycolmap.Database.open(job["database"]) as database:
+        names = [image.name for image in database.read_all_images()]
+        database.clear_two_view_geometries()
+        database.clear_matches()
+        database.clear_descriptors()
+        database.clear_keypoints()
+    extraction, matching = pycolmap.FeatureExtractionOptions(), pycolmap.FeatureMatchingOptions()
+    extraction.num_threads = matching.num_threads = options.threads
+    cpu = pycolmap.Device.cpu  # GPU SIFT gives other features on every run
+    send("extract", 0, len(names))
+    pycolmap.extract_features(job["database"], job["images"], names, extraction_options=extraction, device=cpu)
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = job["pairs"]
+    two_view = pycolmap.TwoViewGeometryOptions()
+    two_view.ransac.random_seed = options.seed
+    send("match", 0, 0)
+    pycolmap.match_image_pairs(job["database"], matching, pairing, verification_options=two_view, device=cpu)
+    return {}
 
 
 def _map(job: dict[str, Any], send: Send) -> dict[str, Any]:
@@ -428,6 +491,7 @@ def _summary(model: Any, folder: str, total: int) -> ModelSummary:
         points=model.num_points3D(),
         observations=model.compute_num_observations(),
         mean_images_per_track=sum(distinct) / max(len(distinct), 1),
+        images_per_track=dict(sorted(Counter(distinct).items())),
         mean_reprojection_error_px=model.compute_mean_reprojection_error(),
         images=tuple(sorted(model.image(image_id).name for image_id in model.reg_image_ids())),
     )
@@ -462,7 +526,7 @@ def _main() -> None:
         channel.flush()
 
     job = json.load(sys.stdin)
-    stage = {"verification": _verify, "comparison": _compare}.get(job["stage"], _map)
+    stage = {"verification": _verify, "comparison": _compare, "SIFT": _sift}.get(job["stage"], _map)
     result = stage(job, lambda step, done, total: write({"step": step, "done": done, "total": total}))
     write({"result": {**result, "peak_memory_mb": peak_memory_mb()}})
 

@@ -62,7 +62,7 @@ class CollectionMatcher:
     ) -> None:
         self._options, self._inputs, self._labels, self._masked = options, inputs, labels, masked
         self._area_matcher, self._point_matcher = area_matcher, point_matcher
-        self._image = lru_cache(2 * options.block_images)(self._read_image)  # those of one block
+        self.image = lru_cache(2 * options.block_images)(self._read_image)  # those of one block
         self._description = lru_cache(_DESCRIPTIONS_IN_MEMORY)(self._describe)
         self.seconds: dict[str, float] = {}
 
@@ -84,7 +84,7 @@ class CollectionMatcher:
         return PairRecord(pair=pair, result=result)
 
     def _match(self, pair: Pair) -> PairResult:
-        image0, image1 = (self._image(name) for name in pair)
+        image0, image1 = (self.image(name) for name in pair)
         failed = {} if self._labels is None or not self._area_matcher.needs_labels else self._labels.set.failed
         reason = next((failed[name] for name in pair if name in failed), "")
         if reason:
@@ -103,4 +103,4 @@ class CollectionMatcher:
 
     def _describe(self, name: str) -> Any:
         labels = None if self._labels is None else self._labels.read(name)
-        return self._area_matcher.describe(self._image(name), labels)
+        return self._area_matcher.describe(self.image(name), labels)

@@ -59,6 +59,8 @@ CARDS = (
     ModelCard(name="ade20k", kind="segmenter", weights=ADE20K, modules=("ai_edge_litert",)),
     ModelCard(name="labels", kind="segmenter"),
     ModelCard(name="sgam", kind="area-matcher"),
+    ModelCard(name="tiles", kind="area-matcher"),
+    ModelCard(name="covisible", kind="area-matcher"),
     ModelCard(name="none", kind="area-matcher"),
 )
 

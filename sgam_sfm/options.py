@@ -20,11 +20,13 @@ from sgam_core import PRESETS, SGAMOptions
 from sgam_core.errors import OptionError, SGAMError
 from sgam_core.options import (
     CollectionOptions,
+    CovisibleOptions,
     CropOptions,
     GeometryOptions,
     PredictionOptions,
     RejectionOptions,
     SemanticOptions,
+    TileOptions,
 )
 from sgam_sfm.keypoints import KeypointOptions
 
@@ -56,7 +58,8 @@ class MatchOptions:
     weights: Path | None = None
     """File with the point matcher's weights, where it does not find its own; for loftr also outdoor or indoor_new."""
     area_matcher: str = "sgam"
-    """sgam: semantic areas. none: the point matcher on whole images, the baseline."""
+    """sgam: semantic areas. Baselines without labels: tiles, a grid paired by a first match of the whole images;
+    covisible, the part that this match shows in both, matched again; none, whole images only."""
     segmenter: str = "coseg"
     """Who makes label maps: coseg learns regions from the collection itself, without a list of classes; ade20k knows 31
     by name (sky, person, car, ...)."""
@@ -104,6 +107,10 @@ class MatchOptions:
     """Crops for the point matcher."""
     semantic: SemanticOptions = field(default_factory=SemanticOptions)
     """SAM: areas and their matching."""
+    tiles: TileOptions = field(default_factory=TileOptions)
+    """Area matcher tiles."""
+    covisible: CovisibleOptions = field(default_factory=CovisibleOptions)
+    """Area matcher covisible."""
     geometry: GeometryOptions = field(default_factory=GeometryOptions)
     """Robust epipolar geometry."""
     prediction: PredictionOptions = field(default_factory=PredictionOptions)

@@ -22,6 +22,16 @@ def available(kind: str) -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in sorted(entry_points(group=KINDS[kind]), key=lambda entry: entry.name)}
 
 
+def require(kind: str, name: str) -> EntryPoint:
+    """The entry point of that name. Raises: OptionError, with the nearest name, when there is none."""
+    known = available(kind)
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise OptionError(f"--{kind} '{name}' is unknown; {hint}known: {', '.join(known)}")
+    return known[name]
+
+
 def create(kind: str, name: str, **settings: Any) -> Any:
     """Make the model of that name.
 
@@ -29,12 +39,7 @@ def create(kind: str, name: str, **settings: Any) -> Any:
     constructor at all.
     Raises: OptionError for an unknown name, with the nearest one, or when a package that it needs is not installed.
     """
-    known = available(kind)
-    if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
-        raise OptionError(f"--{kind} '{name}' is unknown; {hint}known: {', '.join(known)}")
-    entry = known[name]
+    entry = require(kind, name)
     try:
         factory = entry.load()
         taken = inspect.signature(factory).parameters

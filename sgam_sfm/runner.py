@@ -38,23 +38,32 @@ from sgam_sfm.store import PairRecord, PairStore
 from sgam_sfm.summary import summarise_images, summarise_keypoints, summarise_pairs, versions
 
 
-def match_collection(options: MatchOptions, stages: Stages | None = None) -> dict[str, Any]:
+def match_collection(
+    options: MatchOptions, stages: Stages | None = None, point_matcher: PointMatcher | None = None
+) -> dict[str, Any]:
     """Match a collection and reconstruct it with COLMAP; started again, it continues where it stopped.
 
-    Args: stages shows progress and keeps times; none by default.
+    Args: stages shows progress and keeps times; none by default. point_matcher: in place of the one that the options
+        name, and equal to it in what it returns.
     Returns: the content of OUT/summary.json.
     Raises: SGAMError for what cannot be used at all. Single images and pairs that fail are counted in the summary.
     """
     with recording(options.output, stages := stages or Stages(quiet=True)):
-        return _match_collection(options, stages)
+        return _match_collection(options, stages, point_matcher)
 
 
-def _match_collection(options: MatchOptions, stages: Stages) -> dict[str, Any]:
-    options = replace(options, device=str(find_device(options.device, "--device")))
-    use_threads(options.threads)
-    point_matcher: PointMatcher = registry.create(
+def create_matcher(options: MatchOptions) -> PointMatcher:
+    """The point matcher that the options name."""
+    matcher: PointMatcher = registry.create(
         "matcher", options.matcher, weights=options.weights, device=options.device, seed=options.seed
     )
+    return matcher
+
+
+def _match_collection(options: MatchOptions, stages: Stages, point_matcher: PointMatcher | None) -> dict[str, Any]:
+    options = replace(options, device=str(find_device(options.device, "--device")))
+    use_threads(options.threads)
+    point_matcher = point_matcher or create_matcher(options)
     area_matcher: AreaMatcher = registry.create("area-matcher", options.area_matcher, options=options.sgam)
     output = options.output
 

@@ -11,7 +11,14 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from sgam_core import PairResult, SemanticAreaMatcher, SGAMOptions, match_described
+from sgam_core import (
+    CovisibleAreaMatcher,
+    PairResult,
+    SemanticAreaMatcher,
+    SGAMOptions,
+    TileAreaMatcher,
+    match_described,
+)
 from sgam_core.options import changed
 from sgam_sfm.keypoints import merge_keypoints
 from sgam_sfm.scene import correspond
@@ -107,6 +114,19 @@ def test_gmc_adds_true_matches_where_areas_cover_little(room, point_matcher):
         assert result.fallback or (result.matches.area_index >= 0).all()
         assert len(result.matches) <= len(little[pair].matches)
     assert sum(len(r.matches) for r in little.values()) < sum(len(r.matches) for r in everywhere.values())
+
+
+@pytest.mark.parametrize(("matcher", "fewest"), [(TileAreaMatcher(), 50), (CovisibleAreaMatcher(), 9)])
+def test_areas_without_labels_show_the_same_part_of_the_room(room, point_matcher, matcher, fewest):
+    images, options = room.images, SGAMOptions()
+    described = {name: matcher.describe(image, None) for name, image in images.items()}
+    results = {
+        (a, b): match_described(images[a], images[b], described[a], described[b], matcher, point_matcher, options)
+        for a, b in combinations(images, 2)
+    }
+    kept = overlaps(room, results, "kept")
+    assert len(kept) >= fewest
+    assert np.median(kept) > 0.5
 
 
 def test_tracks_follow_points_of_the_room(room, results):

@@ -21,6 +21,7 @@ import os, signal, sys, threading
 from contextlib import contextmanager
 from sgam_sfm import cli, progress
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background of a shell
 wanted, seconds, plain = sys.argv[1], float(sys.argv[2]), progress.Stages.stage
 
 @contextmanager

@@ -1,0 +1,78 @@
+"""`sgam-sfm evaluate`: matches, poses and areas of pairs against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from sgam_sfm.exit_codes import DONE
+from sgam_sfm.logs import logging_to
+from sgam_sfm.options import MatchOptions
+
+_SHOWN = {
+    "matches": ("matches", 0),
+    "mma_1": ("MMA@1", 1),
+    "mma_3": ("MMA@3", 1),
+    "mma_1_at_640": ("MMA@1 at 640", 1),
+    "areas_after_gr": ("areas", 1),
+    "aor_all": ("AOR", 1),
+    "amp_soa": ("AMP SOA", 1),
+    "amp_sia": ("AMP SIA", 1),
+    "amp_gp": ("AMP GP", 1),
+    "amp_after_gr": ("AMP after GR", 1),
+    "megapixels_matched": ("Mpx", 1),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions(MatchOptions):
+    """Two-view and area metrics on pairs whose pose is known; no reconstruction.
+
+    Matches every pair with areas and on whole images, and judges both. Options of `match` mean the same here. Writes
+    OUT/evaluate.json and a table.
+    """
+
+    ground_truth: Path
+    """Known poses, and depth where there is some: Strecha's cameras, a ScanNet scene, a COLMAP model, a CSV, ..."""
+    ground_truth_format: str = ""
+    """Its format, where it cannot be told from the files."""
+    ablation: bool = False
+    """Judge SOA, SIA, both, +GP, +GR, +GP+GR and all of it, and the paper's own rules: the paper's table."""
+    max_pairs: int = 0
+    """Judge only this many pairs, evenly over the list (0: all)."""
+    auc_degrees: tuple[float, ...] = (1.0, 5.0, 10.0, 20.0)
+    """Angles of the pose AUC (the paper: 5, 10, 20)."""
+
+    @property
+    def matching(self) -> MatchOptions:
+        """The options of `match` among these."""
+        return MatchOptions(**{field.name: getattr(self, field.name) for field in fields(MatchOptions)})
+
+
+def run(options: EvaluateOptions, console: Console) -> int:
+    """Evaluate; print the table."""
+    from sgam_sfm.evaluation.evaluate import evaluate
+    from sgam_sfm.progress import Stages
+
+    with logging_to(options.output / "log.txt", console, verbose=options.verbose):
+        content = evaluate(options, Stages(console=console))
+    _print(content, console)
+    return DONE
+
+
+def _print(content: Mapping[str, Any], console: Console) -> None:
+    auc = {f"auc_{degrees:g}": (f"AUC@{degrees:g}", 1) for degrees in content["auc_degrees"]}
+    table = Table(title=f"{content['num_pairs']} pairs", title_justify="left")
+    table.add_column("")
+    rows = auc | _SHOWN
+    for title, _ in rows.values():
+        table.add_column(title, justify="right")
+    for variant in content["variants"]:
+        values = [(variant["figures"].get(name), digits) for name, (_, digits) in rows.items()]
+        table.add_row(variant["name"], *("" if value is None else f"{value:.{digits}f}" for value, digits in values))
+    console.print(table)

@@ -1,0 +1,205 @@
+"""Run every method on the same collection, and put their figures side by side."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic_core import to_jsonable_python
+from rich.console import Console
+from rich.table import Table
+
+from sgam_sfm import registry
+from sgam_sfm.comparison.figures import FIGURES, TIMES, Figure, Spread, figures_of, over_seeds, times_of, verdict
+from sgam_sfm.comparison.methods import Method, budget_reference, parse_methods
+from sgam_sfm.comparison.running import Job, run_apart
+from sgam_sfm.evaluation.ground_truth import GroundTruth, read_ground_truth
+from sgam_sfm.files import write_json
+from sgam_sfm.inputs import Inputs, read_inputs
+from sgam_sfm.label_maps import create_segmenter, write_label_maps
+from sgam_sfm.label_set import RECORD
+from sgam_sfm.machine import find_device
+from sgam_sfm.options import MatchOptions, fingerprint
+from sgam_sfm.pairs import write_pairs
+from sgam_sfm.progress import Stages
+from sgam_sfm.summary import versions
+
+if TYPE_CHECKING:
+    from sgam_sfm.commands.compare import CompareOptions
+
+VERSION = 1
+_log = logging.getLogger(__name__)
+
+
+def compare(options: CompareOptions, console: Console) -> dict[str, Any]:
+    """Run the methods and write OUT/compare.json; started again, it runs what is missing.
+
+    Returns: the content of compare.json, see docs/compare.md.
+    Raises: SGAMError for what cannot be used at all.
+    """
+    methods = parse_methods(options.methods)
+    common = MatchOptions(**{field.name: getattr(options, field.name) for field in fields(MatchOptions)})
+    common = replace(common, device=str(find_device(options.device, "--device")))
+    stages = Stages(console=console)
+    inputs = read_inputs(replace(common, output=options.output / "inputs"), stages)
+    truth = None if options.ground_truth is None else read_ground_truth(options.ground_truth)
+    pairs = _spread_over(inputs.pairs.pairs, options.max_pairs)
+    write_pairs(options.output / "pairs.txt", pairs)
+    common = replace(common, pairs=options.output / "pairs.txt")
+
+    results: dict[str, list[dict[str, Any]]] = {method.slug: [] for method in methods}
+    for seed in range(options.seed, options.seed + options.repeats):
+        labelled = replace(common, labels=_labels(options, common, methods, inputs, seed, stages))
+        for method in sorted(methods, key=lambda method: method.same_budget):
+            folder = options.output / method.slug
+            folder = folder / f"seed-{seed}" if seed != options.seed else folder
+            target = 0
+            if method.same_budget and (reference := budget_reference(methods, method)) is not None:
+                target = results[reference.slug][-1]["summary"]["pairs"]["pixels_matched"]
+            job = Job(
+                method=method,
+                options=method.applied(labelled, folder, seed),
+                cache=options.output / "cache" / "matches",
+                target=target,
+                max_image_size=options.max_image_size,
+            )
+            results[method.slug].append(_run(job, inputs, truth))
+    content = _content(options, methods, inputs, len(pairs), truth, results)
+    write_json(options.output / "compare.json", content)
+    return content
+
+
+def _labels(
+    options: CompareOptions,
+    common: MatchOptions,
+    methods: Sequence[Method],
+    inputs: Inputs,
+    seed: int,
+    stages: Stages,
+) -> Path | None:
+    """One folder of label maps for all methods of a seed; label maps that were given serve all seeds."""
+    if options.labels is not None:
+        return options.labels
+    area_matchers = {method.area_matcher for method in methods} - {""}
+    if not any(registry.create("area-matcher", name, options=common.sgam).needs_labels for name in area_matchers):
+        return None
+    folder = options.output / "labels" / f"seed-{seed}"
+    if not (folder / RECORD).exists():
+        segmenter = create_segmenter(replace(common, seed=seed), options.output / "cache" / "segmenter")
+        write_label_maps(segmenter, options.segmenter, inputs.images, folder, stages, full_size=True)
+    return folder
+
+
+def _run(job: Job, inputs: Inputs, truth: GroundTruth | None) -> dict[str, Any]:
+    """Run a method, unless its result is there already; figures are taken anew, since the truth may be another one."""
+    path = job.options.output / "result.json"
+    digests = {name: file.digest for name, file in inputs.images.items()}
+    mark = fingerprint(job.options, images=digests, budget=(job.target, job.max_image_size))
+    result = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    if result.get("fingerprint") != mark:
+        result = run_apart(job) | {"fingerprint": mark}
+        write_json(path, result)
+    folder = job.options.output
+    return result | {
+        "seed": job.options.seed,
+        "folder": str(folder),
+        "figures": figures_of(result, folder, truth),
+        "times": times_of(result),
+    }
+
+
+def _spread_over(pairs: Sequence[tuple[str, str]], wanted: int) -> list[tuple[str, str]]:
+    """At most `wanted` pairs (0: all), evenly over the list."""
+    if not wanted or wanted >= len(pairs):
+        return list(pairs)
+    return [pairs[round(k * (len(pairs) - 1) / max(wanted - 1, 1))] for k in range(wanted)]
+
+
+def _content(
+    options: CompareOptions,
+    methods: Sequence[Method],
+    inputs: Inputs,
+    num_pairs: int,
+    truth: GroundTruth | None,
+    results: Mapping[str, Sequence[Mapping[str, Any]]],
+) -> dict[str, Any]:
+    figures = {slug: over_seeds([run["figures"] for run in runs]) for slug, runs in results.items()}
+    times = {slug: over_seeds([run["times"] for run in runs]) for slug, runs in results.items()}
+    plain = (method for method in methods if method.area_matcher == "none" and not method.same_budget)
+    reference = next(plain, methods[0])
+    known = None if truth is None else {"path": str(truth.source), "format": truth.format, "unit": truth.unit}
+    content = {
+        "version": VERSION,
+        "collection": {
+            "images": str(options.images.absolute()),
+            "num_images": len(inputs.images),
+            "num_pairs": num_pairs,
+            "ground_truth": known,
+        },
+        "reference": reference.slug,
+        "methods": [
+            {
+                "name": method.name,
+                "slug": method.slug,
+                "figures": figures[method.slug],
+                "verdicts": _verdicts(figures[method.slug], figures[reference.slug]),
+                "times": times[method.slug],
+                "cap": results[method.slug][0]["cap"],
+                "runs": [_run_content(run) for run in results[method.slug]],
+            }
+            for method in methods
+        ],
+        "versions": versions(),
+    }
+    as_json: dict[str, Any] = to_jsonable_python(content)
+    return as_json
+
+
+def _verdicts(figures: Mapping[str, Spread | None], reference: Mapping[str, Spread | None]) -> dict[str, str]:
+    return {figure.name: verdict(figure, figures.get(figure.name), reference.get(figure.name)) for figure in FIGURES}
+
+
+def _run_content(run: Mapping[str, Any]) -> dict[str, Any]:
+    summary = run["summary"]
+    models = summary["models"]
+    return {
+        "seed": run["seed"],
+        "folder": run["folder"],
+        "figures": run["figures"],
+        "times": run["times"] | {"stages": summary["seconds"]},
+        "images_per_track": models[0]["images_per_track"] if models else {},
+        "no_model": summary["no_model"],
+        "fallbacks": summary["pairs"].get("fallbacks", {}),
+    }
+
+
+def print_table(content: Mapping[str, Any], console: Console) -> None:
+    """Figures down, methods across; green for a gain over the reference, red for a loss, nothing for a tie."""
+    table = Table(title=f"against {content['reference']}", title_justify="left")
+    table.add_column("")
+    for method in content["methods"]:
+        table.add_column(method["name"], justify="right", overflow="fold")
+    for figure in (*FIGURES, *TIMES):
+        cells = [_cell(figure, method) for method in content["methods"]]
+        if any(cells):
+            table.add_row(figure.title, *cells)
+    console.print(table)
+    for method in content["methods"]:
+        if method["cap"]:
+            console.print(f"{method['name']}: the budget could not be spent, capped at {method['cap']}")
+
+
+def _cell(figure: Figure, method: Mapping[str, Any]) -> str:
+    value = (method["figures"] | method["times"]).get(figure.name)
+    if value is None:
+        return ""
+    spread = Spread(**value)
+    text = f"{spread.mean:.{figure.digits}f}"
+    if spread.spread is not None:
+        text += f" ±{spread.spread:.{figure.digits}f}"
+    colour = {"gain": "green", "loss": "red"}.get(method["verdicts"].get(figure.name, ""))
+    return f"[{colour}]{text}[/]" if colour else text

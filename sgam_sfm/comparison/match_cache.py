@@ -1,0 +1,96 @@
+"""Point matches of crops on disk, so that what several methods or seeds ask for is computed once."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from sgam_core import Crop, Matches, PointMatcher
+from sgam_sfm.files import replacing
+
+
+@dataclass
+class CachedMatcher:
+    """A point matcher (`sgam_core.protocols.PointMatcher`) that looks its results up before it computes them.
+
+    A result that is looked up is charged with the seconds that it cost when it was computed, so that the run time of a
+    method does not depend on what ran before it.
+
+    digests: of the images' files, by name. key: of the point matcher, its options and masks. folder: of the results.
+    charged: seconds that all results cost since `start`; saved: those of them that were not spent again. crops: pixels
+    of the different crops asked for since `start`.
+    """
+
+    matcher: PointMatcher
+    digests: Mapping[str, str]
+    key: str
+    folder: Path
+    charged: float = 0.0
+    saved: float = 0.0
+    crops: dict[tuple, int] = field(default_factory=dict)
+
+    def start(self) -> None:
+        """Begin to count anew."""
+        self.charged = self.saved = 0.0
+        self.crops.clear()
+
+    def reset(self) -> None:
+        """Forget what the point matcher has in memory."""
+        reset = getattr(self.matcher, "reset", None)
+        if reset is not None:
+            reset()
+
+    @property
+    def pixels_extracted(self) -> int:
+        """Pixels of all different crops asked for, each counted once."""
+        return sum(self.crops.values())
+
+    def match(self, pairs: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
+        """Match every pair of crops; see `PointMatcher.match`."""
+        for pair in pairs:
+            self.crops |= {crop.key: crop.size[0] * crop.size[1] for crop in pair}
+        paths = [self._path(*pair) for pair in pairs]
+        missing = [row for row, path in enumerate(paths) if not path.exists()]
+        if missing:
+            start = time.perf_counter()
+            computed = self.matcher.match([pairs[row] for row in missing])
+            seconds = time.perf_counter() - start
+            pixels = np.array([sum(crop.size[0] * crop.size[1] for crop in pairs[row]) for row in missing], float)
+            for row, matches, share in zip(missing, computed, pixels / pixels.sum(), strict=True):
+                _write(paths[row], matches, seconds * share)
+            self.saved -= seconds
+        found = [_read(path) for path in paths]
+        cost = sum(seconds for _, seconds in found)
+        self.charged += cost
+        self.saved += cost
+        return [matches for matches, _ in found]
+
+    def _path(self, crop0: Crop, crop1: Crop) -> Path:
+        sides = [(self.digests[crop.image.name], *crop.key[1:]) for crop in (crop0, crop1)]
+        name = hashlib.sha256(repr((self.key, sides)).encode()).hexdigest()[:32]
+        return self.folder / name[:2] / f"{name}.npz"
+
+
+def _write(path: Path, matches: Matches, seconds: float) -> None:
+    with replacing(path) as partial, partial.open("wb") as file:
+        np.savez(
+            file,
+            points0=matches.points0,
+            points1=matches.points1,
+            scores=matches.scores,
+            sigmas0=matches.sigmas0,
+            sigmas1=matches.sigmas1,
+            seconds=np.array(seconds),
+        )
+
+
+def _read(path: Path) -> tuple[Matches, float]:
+    with np.load(path) as file:
+        content = {name: file[name] for name in file.files}
+    seconds = float(content.pop("seconds"))
+    return Matches(**content), seconds

@@ -1,0 +1,245 @@
+"""Judge pairs with a known pose: every variant of the options on the same pairs, sliced by what makes a pair hard."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from math import inf
+from statistics import fmean
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic_core import to_jsonable_python
+
+from sgam_core import AreaMatcher, Matches, match_whole
+from sgam_core.errors import InputError
+from sgam_core.options import changed
+from sgam_sfm import registry
+from sgam_sfm.comparison.match_cache import CachedMatcher
+from sgam_sfm.evaluation.ground_truth import GroundTruth, TrueView, read_ground_truth
+from sgam_sfm.evaluation.metrics import area_matching_precision, pose_auc
+from sgam_sfm.evaluation.two_view import PIXELS, JudgedPair, TruePair, judge_pair, overlaps, true_pair
+from sgam_sfm.files import write_json
+from sgam_sfm.inputs import Inputs, read_inputs
+from sgam_sfm.label_maps import LabelMaps, make_label_maps
+from sgam_sfm.machine import find_device, use_threads
+from sgam_sfm.matching import CollectionMatcher
+from sgam_sfm.options import MatchOptions
+from sgam_sfm.pairs import Pair
+from sgam_sfm.progress import Stages
+from sgam_sfm.runner import create_matcher
+from sgam_sfm.summary import versions
+
+if TYPE_CHECKING:
+    from sgam_sfm.commands.evaluate import EvaluateOptions
+
+VERSION = 1
+_AMP_OVERLAP = 0.7
+_log = logging.getLogger(__name__)
+
+_OFF = {"prediction__enabled": False, "rejection__rule": "none", "collection__rule": "none"}
+_ABLATION: Mapping[str, Mapping[str, Any]] = {
+    "SOA": {**_OFF, "semantic__intersections__enabled": False},
+    "SIA": {**_OFF, "semantic__objects__enabled": False},
+    "SOA+SIA": _OFF,
+    "+GP": {"rejection__rule": "none", "collection__rule": "none"},
+    "+GR": {"prediction__enabled": False, "collection__rule": "none"},
+    "+GP+GR": {"collection__rule": "none"},
+    "full": {},
+    "full, GR paper": {"rejection__rule": "paper", "collection__rule": "paper"},
+    "full, GR paper-literal": {"rejection__rule": "paper-literal", "collection__rule": "paper-literal"},
+}
+"""The paper's table of components, and its own rules of GR and GMC."""
+
+_SLICES: Mapping[str, tuple[Callable[[TruePair], float | None], Sequence[tuple[float, float]]]] = {
+    "rotation, degrees": (lambda pair: pair.angle_deg, ((0, 15), (15, 30), (30, 45), (45, 180))),
+    "scale change": (lambda pair: pair.scale_change, ((1, 1.5), (1.5, 2.5), (2.5, inf))),
+    "overlap": (lambda pair: pair.overlap, ((0, 0.3), (0.3, 0.6), (0.6, 1.01))),
+}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Variant:
+    """Options under a name."""
+
+    name: str
+    options: MatchOptions
+
+
+def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
+    """Match every pair with a known pose under every variant, judge it, and write OUT/evaluate.json.
+
+    Returns: the content of evaluate.json. Raises: SGAMError for what cannot be used at all.
+    """
+    common = replace(options.matching, device=str(find_device(options.device, "--device")))
+    use_threads(common.threads)
+    truth = read_ground_truth(options.ground_truth, options.ground_truth_format or None, common.images)
+    inputs = read_inputs(common, stages)
+    names = truth.match_names(inputs.images)
+    pairs = _pairs(inputs, truth, names, options)
+    variants = _variants(common, ablation=options.ablation)
+    needs_labels = any(_area_matcher(variant.options).needs_labels for variant in variants)
+    labels = make_label_maps(common, inputs.images, stages) if needs_labels else None
+    digests = {name: file.digest for name, file in inputs.images.items()}
+    key = repr((common.matcher, common.weights, common.mask_path, common.mask_matches, common.labels))
+    matcher = CachedMatcher(create_matcher(common), digests, key, common.output / "cache" / "matches")
+
+    facts = {}
+    whole: dict[Pair, Matches] = {}
+    plain = CollectionMatcher(common, inputs, None, (), registry.create("area-matcher", "none"), matcher)
+    with stages.stage("Matching whole images", len(pairs)) as advance:
+        for pair in pairs:
+            whole[pair] = match_whole(plain.image(pair[0]), plain.image(pair[1]), matcher, common.crop)
+            facts[pair] = true_pair(truth, _views(truth, names, pair), whole[pair])
+            advance(1)
+    judged = {}
+    for variant in variants:
+        with stages.stage(variant.name, len(pairs)) as advance:
+            judged[variant.name] = _judge(variant, inputs, labels, matcher, pairs, truth, names, whole, advance)
+    content = {
+        "version": VERSION,
+        "ground_truth": {"path": str(truth.source), "format": truth.format, "unit": truth.unit},
+        "num_pairs": len(pairs),
+        "num_labels": len(labels.set.labels) if labels else 0,
+        "auc_degrees": options.auc_degrees,
+        "pixels": PIXELS,
+        "variants": [
+            {
+                "name": name,
+                "figures": figures_of(list(results.values()), options.auc_degrees),
+                "seconds": _seconds(list(results.values())),
+                "slices": _sliced(results, facts, options.auc_degrees),
+                "pairs": [{"pair": pair, **asdict(facts[pair]), **asdict(result)} for pair, result in results.items()],
+            }
+            for name, results in judged.items()
+        ],
+        "versions": versions(),
+    }
+    write_json(common.output / "evaluate.json", content)
+    as_json: dict[str, Any] = to_jsonable_python(content)
+    return as_json
+
+
+def figures_of(pairs: Sequence[JudgedPair], auc_degrees: Sequence[float]) -> dict[str, float | None]:
+    """The metrics of some pairs: means over pairs for matches, over areas for areas; None where there is nothing."""
+    if not pairs:
+        return {}
+    figures: dict[str, float | None] = {"matches": fmean(pair.num_matches for pair in pairs)}
+    for index, pixels in enumerate(PIXELS):
+        figures[f"mma_{pixels}"] = 100 * fmean(pair.precision[index] for pair in pairs)
+        figures[f"mma_{pixels}_at_640"] = 100 * fmean(pair.precision_640[index] for pair in pairs)
+    areas = pose_auc([pair.pose_error_deg for pair in pairs], auc_degrees)
+    figures |= {f"auc_{degrees:g}": 100 * area for degrees, area in zip(auc_degrees, areas, strict=True)}
+    for name, chosen in (
+        ("soa", overlaps(pairs, kind="object", stage="putative")),
+        ("sia", overlaps(pairs, kind="intersection", stage="putative")),
+        ("gp", overlaps(pairs, stage="predicted")),
+        ("all", overlaps(pairs)),
+        ("after_gr", overlaps(pairs, kept=True)),
+    ):
+        known = [overlap for overlap in chosen if not np.isnan(overlap)]
+        figures[f"areas_{name}"] = len(chosen) / len(pairs)
+        figures[f"aor_{name}"] = 100 * fmean(known) if known else None
+        figures[f"amp_{name}"] = 100 * area_matching_precision(known, _AMP_OVERLAP) if known else None
+    figures["fallbacks"] = 100 * fmean(bool(pair.fallback) for pair in pairs)
+    figures["megapixels_matched"] = fmean(pair.pixels_matched for pair in pairs) / 1e6
+    return figures
+
+
+def _variants(common: MatchOptions, *, ablation: bool) -> list[Variant]:
+    plain = Variant(name="whole images", options=replace(common, area_matcher="none"))
+    if ablation:
+        return [plain, *(Variant(name=name, options=changed(common, **change)) for name, change in _ABLATION.items())]
+    return [plain, Variant(name=common.area_matcher, options=common)]
+
+
+def _area_matcher(options: MatchOptions, ignored: Sequence[int] = ()) -> AreaMatcher:
+    matcher: AreaMatcher = registry.create("area-matcher", options.area_matcher, options=options.sgam_ignoring(ignored))
+    return matcher
+
+
+def _pairs(inputs: Inputs, truth: GroundTruth, names: Mapping[str, str], options: EvaluateOptions) -> list[Pair]:
+    """The pairs that were asked for, or published with the truth, or all; of those, the ones whose pose is known."""
+    asked = inputs.pairs.pairs
+    if options.pairs is None and truth.pairs is not None:
+        by_view = {view: name for name, view in names.items()}
+        asked = tuple((by_view[a], by_view[b]) for a, b in truth.pairs if a in by_view and b in by_view)
+    known = [
+        (a, b) for a, b in asked if a in names and b in names and truth.relative_pose(names[a], names[b]) is not None
+    ]
+    if not known:
+        raise InputError(
+            f"none of the {len(asked)} pairs has a known pose in '{truth.source}' ({truth.format}); its images are "
+            f"named like '{min(truth.views, default='-')}', those of the folder like '{min(inputs.images)}'"
+        )
+    if options.max_pairs and len(known) > options.max_pairs:
+        rows = np.linspace(0, len(known) - 1, options.max_pairs).round().astype(int)
+        known = [known[row] for row in rows]
+    return known
+
+
+def _views(truth: GroundTruth, names: Mapping[str, str], pair: Pair) -> tuple[TrueView, TrueView]:
+    return truth.views[names[pair[0]]], truth.views[names[pair[1]]]
+
+
+def _judge(
+    variant: Variant,
+    inputs: Inputs,
+    labels: LabelMaps | None,
+    matcher: CachedMatcher,
+    pairs: Sequence[Pair],
+    truth: GroundTruth,
+    names: Mapping[str, str],
+    whole: Mapping[Pair, Matches],
+    advance: Callable[[float], None],
+) -> dict[Pair, JudgedPair]:
+    options = variant.options
+    ignored = (*labels.set.ignored, *labels.set.ids(options.ignore_labels, "--ignore-labels")) if labels else ()
+    masked = labels.set.ids(options.mask_matches, "--mask-matches") if labels else ()
+    collection = CollectionMatcher(options, inputs, labels, masked, _area_matcher(options, ignored), matcher)
+    judged = {}
+    for number, pair in enumerate(pairs):
+        matcher.start()
+        record = collection.match(pair)
+        if record.result is None:
+            raise InputError(f"the pair '{pair[0]}' - '{pair[1]}' cannot be matched: {record.error}")
+        # Results that were looked up are charged with what they cost when they were computed.
+        seconds = {**record.result.seconds, "point matching": matcher.charged}
+        rng = np.random.default_rng([options.seed, number])
+        result = replace(record.result, seconds=seconds)
+        judged[pair] = judge_pair(truth, _views(truth, names, pair), result, whole[pair], rng, 500)
+        advance(1)
+    return judged
+
+
+def _seconds(pairs: Sequence[JudgedPair]) -> dict[str, float]:
+    """Seconds a pair by stage."""
+    total: Counter[str] = Counter()
+    for pair in pairs:
+        total.update(pair.seconds)
+    return {stage: seconds / max(len(pairs), 1) for stage, seconds in total.items()}
+
+
+def _sliced(
+    results: Mapping[Pair, JudgedPair], facts: Mapping[Pair, TruePair], auc_degrees: Sequence[float]
+) -> list[dict[str, Any]]:
+    slices = []
+    for title, (value_of, bounds) in _SLICES.items():
+        for low, high in bounds:
+            chosen = [
+                result
+                for pair, result in results.items()
+                if (value := value_of(facts[pair])) is not None and low <= value < high
+            ]
+            slices.append(
+                {
+                    "by": title,
+                    "from": low,
+                    "to": None if high == inf else high,
+                    "num_pairs": len(chosen),
+                    "figures": figures_of(chosen, auc_degrees),
+                }
+            )
+    return slices
