@@ -63,8 +63,8 @@ class CovisibleAreaMatcher:
         return PutativeAreas(confident=(AreaMatch(area0=area0, area1=area1, distance=1 - len(used) / len(whole)),))
 
     def crop(self, image: Image, box: Box, options: CropOptions) -> Crop:
-        """The box itself at the size of a whole image, which it replaces."""
-        return box_crop(image, box, options.image_size, upsample=options.upsample)
+        """The box itself, at least at the size of a whole image, which it replaces."""
+        return box_crop(image, box, max(options.image_size, options.area_size), upsample=options.upsample)
 
 
 def consistent(matches: Matches, frame0: Frame, frame1: Frame, geometry: GeometryOptions) -> Matches:

@@ -152,7 +152,7 @@ class TileOptions(_Checked):
 class CovisibleOptions(_Checked):
     """Covisible: one area an image, where a first match of the whole images lies; no labels.
 
-    Its crop has image_size, not area_size: it replaces the whole image.
+    Its crop has the larger of image_size and area_size: it replaces the whole image.
     """
 
     min_matches: int = 20

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from sgam_sfm.exit_codes import DONE
 from sgam_sfm.logs import logging_to
@@ -19,13 +18,17 @@ _SHOWN = {
     "mma_1": ("MMA@1", 1),
     "mma_3": ("MMA@3", 1),
     "mma_1_at_640": ("MMA@1 at 640", 1),
-    "areas_after_gr": ("areas", 1),
-    "aor_all": ("AOR", 1),
+    "areas_after_gr": ("areas after GR", 1),
+    "aor_soa": ("AOR SOA", 1),
+    "aor_sia": ("AOR SIA", 1),
+    "aor_gp": ("AOR GP", 1),
+    "aor_after_gr": ("AOR after GR", 1),
     "amp_soa": ("AMP SOA", 1),
     "amp_sia": ("AMP SIA", 1),
     "amp_gp": ("AMP GP", 1),
     "amp_after_gr": ("AMP after GR", 1),
-    "megapixels_matched": ("Mpx", 1),
+    "fallbacks": ("fallbacks, %", 0),
+    "megapixels_matched": ("Mpx a pair", 2),
 }
 
 
@@ -66,13 +69,16 @@ def run(options: EvaluateOptions, console: Console) -> int:
 
 
 def _print(content: Mapping[str, Any], console: Console) -> None:
+    from sgam_sfm.tables import print_figures
+
     auc = {f"auc_{degrees:g}": (f"AUC@{degrees:g}", 1) for degrees in content["auc_degrees"]}
-    table = Table(title=f"{content['num_pairs']} pairs", title_justify="left")
-    table.add_column("")
-    rows = auc | _SHOWN
-    for title, _ in rows.values():
-        table.add_column(title, justify="right")
-    for variant in content["variants"]:
-        values = [(variant["figures"].get(name), digits) for name, (_, digits) in rows.items()]
-        table.add_row(variant["name"], *("" if value is None else f"{value:.{digits}f}" for value, digits in values))
-    console.print(table)
+    variants = content["variants"]
+    rows = [
+        (title, [_cell(variant["figures"].get(name), digits) for variant in variants])
+        for name, (title, digits) in (auc | _SHOWN).items()
+    ]
+    print_figures(f"{content['num_pairs']} pairs", [variant["name"] for variant in variants], rows, console)
+
+
+def _cell(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"

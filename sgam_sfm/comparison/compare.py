@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic_core import to_jsonable_python
 from rich.console import Console
-from rich.table import Table
 
 from sgam_sfm import registry
 from sgam_sfm.comparison.figures import FIGURES, TIMES, Figure, Spread, figures_of, over_seeds, times_of, verdict
@@ -27,6 +26,7 @@ from sgam_sfm.options import MatchOptions, fingerprint
 from sgam_sfm.pairs import write_pairs
 from sgam_sfm.progress import Stages
 from sgam_sfm.summary import versions
+from sgam_sfm.tables import print_figures
 
 if TYPE_CHECKING:
     from sgam_sfm.commands.compare import CompareOptions
@@ -179,15 +179,9 @@ def _run_content(run: Mapping[str, Any]) -> dict[str, Any]:
 
 def print_table(content: Mapping[str, Any], console: Console) -> None:
     """Figures down, methods across; green for a gain over the reference, red for a loss, nothing for a tie."""
-    table = Table(title=f"against {content['reference']}", title_justify="left")
-    table.add_column("")
-    for method in content["methods"]:
-        table.add_column(method["name"], justify="right", overflow="fold")
-    for figure in (*FIGURES, *TIMES):
-        cells = [_cell(figure, method) for method in content["methods"]]
-        if any(cells):
-            table.add_row(figure.title, *cells)
-    console.print(table)
+    methods = content["methods"]
+    rows = [(figure.title, [_cell(figure, method) for method in methods]) for figure in (*FIGURES, *TIMES)]
+    print_figures(f"against {content['reference']}", [method["name"] for method in methods], rows, console)
     for method in content["methods"]:
         if method["cap"]:
             console.print(f"{method['name']}: the budget could not be spent, capped at {method['cap']}")

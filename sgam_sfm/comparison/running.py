@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -121,5 +122,6 @@ def _run_sift(job: Job, stages: Stages) -> dict[str, Any]:
             "seconds": stages.seconds,
         }
         write_json(options.output / "summary.json", summary)
+        summary = json.loads((options.output / "summary.json").read_text(encoding="utf-8"))
     pixels = sum(file.width * file.height for file in inputs.images.values())
     return {"summary": summary, "pixels_extracted": pixels, "saved_seconds": 0.0, "cap": ""}

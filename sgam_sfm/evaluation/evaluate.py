@@ -88,7 +88,8 @@ def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
 
     facts = {}
     whole: dict[Pair, Matches] = {}
-    plain = CollectionMatcher(common, inputs, None, (), registry.create("area-matcher", "none"), matcher)
+    whole_images = _area_matcher(replace(common, area_matcher="none"))
+    plain = CollectionMatcher(common, inputs, None, (), whole_images, matcher)
     with stages.stage("Matching whole images", len(pairs)) as advance:
         for pair in pairs:
             whole[pair] = match_whole(plain.image(pair[0]), plain.image(pair[1]), matcher, common.crop)

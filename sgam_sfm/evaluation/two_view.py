@@ -23,8 +23,8 @@ from sgam_sfm.evaluation.metrics import (
 )
 from sgam_sfm.evaluation.projection import triangulate
 
-PIXELS = (1, 3, 5)
-"""Thresholds of precision and MMA."""
+PIXELS = (1, 2, 3, 5)
+"""Thresholds of precision and MMA; the paper has 1, 2, 3."""
 PAPER_WIDTH = 640
 
 
@@ -57,7 +57,7 @@ class JudgedArea:
 class JudgedPair:
     """How a pair came out.
 
-    precision, precision_640: share of the matches within 1, 3, 5 pixels, at the image's own pixels and at 640 wide.
+    precision, precision_640: share of the matches within `PIXELS`, at the image's own pixels and at 640 wide.
     by_depth: share of the matches that depth judged. pose_error_deg: 180 when there is no pose. fallback: as in
     `PairResult`. pixels_matched: of every point-matcher call. seconds: by stage.
     """

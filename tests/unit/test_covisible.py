@@ -165,3 +165,11 @@ def test_boxes_lie_inside_and_swapping_the_images_swaps_them(size0, size1, quant
         for b, (width, height) in ((found.area0.box, size0), (found.area1.box, size1)):
             assert 0 <= b.x0 < b.x1 <= width
             assert 0 <= b.y0 < b.y1 <= height
+
+
+def test_a_crop_is_finer_than_the_whole_image_where_areas_are():
+    image = Image(name="a", pixels=np.zeros((1000, 2000, 3), np.uint8))
+    box = Box(x0=0, y0=0, x1=1600, y1=800)
+    matcher = CovisibleAreaMatcher()
+    for area_size, width in ((640, 1024), (1400, 1400)):
+        assert matcher.crop(image, box, CropOptions(area_size=area_size, image_size=1024)).size[0] == width

@@ -1,0 +1,121 @@
+"""`sgam-sfm compare` and `evaluate` on the rendered room, against its exact truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sgam_sfm import cli
+from sgam_sfm.exit_codes import DONE, USAGE
+from sgam_sfm.scene import write_ground_truth
+from tests.room import Room, write_room
+
+METHODS = ("sgam:xfeat-star", "none:xfeat-star", "covisible:xfeat-star@budget=match", "sift")
+
+
+@pytest.fixture(scope="module")
+def folder(room: Room, tmp_path_factory) -> Path:
+    """Four neighbours of the room, and their true poses."""
+    folder = write_room(room, tmp_path_factory.mktemp("room"))
+    for name in list(room.images)[4:]:
+        (folder / "images" / name).unlink()
+    (folder / "pairs.txt").unlink()
+    (folder / "truth").mkdir()
+    write_ground_truth(folder / "truth", list(room.views.values())[:4])
+    return folder
+
+
+def common(folder: Path, output: Path) -> list[str]:
+    return [
+        *("--images", str(folder / "images"), "--labels", str(folder / "labels"), "--output", str(output)),
+        *("--cameras", str(folder / "cameras.txt"), "--ground-truth", str(folder / "truth")),
+        *("--area-size", "320", "--image-size", "480", "--max-crop-pixels", "400000"),
+    ]
+
+
+@pytest.fixture(scope="module")
+def compared(folder: Path, tmp_path_factory) -> Path:
+    output = tmp_path_factory.mktemp("compare") / "out"
+    assert cli.run(["compare", *common(folder, output), "--methods", *METHODS]) == DONE
+    return output
+
+
+def content_of(output: Path) -> dict:
+    return json.loads((output / "compare.json").read_text())
+
+
+def without_times(content: dict) -> dict:
+    """What two runs with one seed have in common."""
+    for method in content["methods"]:
+        del method["times"]
+        for run in method["runs"]:
+            del run["times"], run["folder"]
+    return content
+
+
+def test_every_method_has_its_figures_and_its_price(compared):
+    content = content_of(compared)
+    assert content["reference"] == "none_xfeat-star"
+    assert [method["name"] for method in content["methods"]] == list(METHODS)
+    for method in content["methods"]:
+        figures = {name: value and value["mean"] for name, value in method["figures"].items()}
+        assert figures["registered"] == 4
+        assert figures["auc_3"] > 50
+        assert figures["points"] > 100
+        assert figures["center_error"] < 0.05
+        assert method["times"]["matching_seconds"]["mean"] > 0
+        assert (compared / method["slug"] / "database.db").exists()
+    sgam, plain, covisible, _ = content["methods"]
+    assert sgam["figures"]["megapixels_matched"]["mean"] > plain["figures"]["megapixels_matched"]["mean"]
+    assert sgam["verdicts"]["points"] == "gain"
+    assert set(plain["verdicts"].values()) <= {"tie", ""}
+    spent = covisible["figures"]["megapixels_matched"]["mean"]
+    assert covisible["cap"] or spent == pytest.approx(sgam["figures"]["megapixels_matched"]["mean"], rel=0.02)
+
+
+def test_one_seed_gives_one_result_but_for_times(folder, compared, tmp_path):
+    assert cli.run(["compare", *common(folder, tmp_path / "out"), "--methods", *METHODS]) == DONE
+    assert without_times(content_of(tmp_path / "out")) == without_times(content_of(compared))
+
+
+def test_started_again_it_runs_nothing_that_is_there(folder, compared):
+    databases = {path: path.stat().st_mtime_ns for path in compared.glob("*/database.db")}
+    before = without_times(content_of(compared))
+    assert cli.run(["compare", *common(folder, compared), "--methods", *METHODS]) == DONE
+    assert databases == {path: path.stat().st_mtime_ns for path in compared.glob("*/database.db")}
+    assert without_times(content_of(compared)) == before
+
+
+def test_matches_of_crops_are_shared_between_methods(compared):
+    content = content_of(compared)
+    sgam, plain = (
+        json.loads((compared / slug / "result.json").read_text()) for slug in ("sgam_xfeat-star", "none_xfeat-star")
+    )
+    assert sgam["saved_seconds"] < 0.5
+    assert plain["saved_seconds"] > 0.5 * content["methods"][1]["times"]["matching_seconds"]["mean"]
+
+
+def test_wrong_methods_are_told_before_anything_runs(folder, tmp_path, capsys):
+    assert cli.run(["compare", *common(folder, tmp_path / "out"), "--methods", "sgam:xfeat"]) == USAGE
+    assert "method 'sgam:xfeat': --matcher 'xfeat' is unknown; did you mean 'xfeat-star'?" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "labels").exists()
+
+
+def test_evaluate_judges_matches_poses_and_areas(folder, tmp_path):
+    output = tmp_path / "out"
+    assert cli.run(["evaluate", *common(folder, output), "--ablation", "--max-pairs", "3"]) == DONE
+    content = json.loads((output / "evaluate.json").read_text())
+    assert content["num_pairs"] == 3
+    figures = {variant["name"]: variant["figures"] for variant in content["variants"]}
+    assert figures["whole images"]["mma_3"] > 85
+    assert figures["full"]["mma_1"] > 60
+    assert figures["full"]["auc_5"] > 60
+    assert figures["SOA"]["areas_sia"] == figures["SIA"]["areas_soa"] == 0
+    assert figures["SOA+SIA"]["areas_all"] >= max(figures["SOA"]["areas_all"], figures["SIA"]["areas_all"])
+    assert figures["full"]["amp_after_gr"] >= figures["SOA+SIA"]["amp_all"]
+    assert figures["whole images"]["aor_all"] is None
+    full = next(variant for variant in content["variants"] if variant["name"] == "full")
+    assert sum(part["num_pairs"] for part in full["slices"] if part["by"] == "rotation, degrees") == 3
+    assert {"area matching", "point matching", "GP", "GR", "GMC"} <= set(full["seconds"])
