@@ -17,17 +17,16 @@ from rich.console import Console
 from rich.markup import escape
 
 from sgam_core.errors import OptionError, SGAMError
-from sgam_sfm.commands.compare import CompareOptions
 from sgam_sfm.commands.demo import DemoOptions
 from sgam_sfm.commands.doctor import DoctorOptions
-from sgam_sfm.commands.evaluate import EvaluateOptions
 from sgam_sfm.commands.models import ModelsOptions
-from sgam_sfm.commands.segment import SegmentOptions
 from sgam_sfm.commands.show import ShowOptions
 from sgam_sfm.commands.status import StatusOptions
+from sgam_sfm.comparison.options import CompareOptions
+from sgam_sfm.evaluation.options import EvaluateOptions
 from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED, MEANINGS, USAGE
 from sgam_sfm.files import disk_is_full
-from sgam_sfm.options import MatchOptions, starting_options
+from sgam_sfm.options import MatchOptions, SegmentOptions, starting_options
 
 _COMMANDS = {
     MatchOptions: "match",

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Int32
@@ -20,12 +19,9 @@ from sgam_sfm.files import replacing, write_json
 from sgam_sfm.images import ImageFile, read_label_map
 from sgam_sfm.label_set import RECORD, Label, LabelSet, at_size_of, read_label_set
 from sgam_sfm.machine import find_device
-from sgam_sfm.options import MatchOptions
+from sgam_sfm.options import MatchOptions, SegmentOptions
 from sgam_sfm.progress import Stages
 from sgam_sfm.segmenters.protocol import Segmenter
-
-if TYPE_CHECKING:
-    from sgam_sfm.commands.segment import SegmentOptions
 
 _MAX_LABELS_OF_IMAGE = 1000  # areas are counted label by label
 

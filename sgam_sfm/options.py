@@ -134,6 +134,41 @@ class MatchOptions:
         return replace(self.sgam, semantic=replace(self.semantic, ignored_labels=ignored))
 
 
+@dataclass(frozen=True, kw_only=True)
+class SegmentOptions:
+    """Label maps of a folder of photos, with overlays to look at.
+
+    Writes <image name>.png (ids), overlays/<image name>.jpg and labels.json (ids, colours, names where there are any,
+    ignored ones). `sgam-sfm match --labels` reads the folder back, as if it had segmented the photos itself.
+    """
+
+    images: Path
+    """Folder of photos; sub-folders are searched too."""
+    output: Path
+    """Folder for the label maps; made when missing."""
+    segmenter: str = "coseg"
+    """Who makes them: coseg learns regions from the collection itself, without a list of classes; ade20k knows 31
+    by name (sky, person, car, ...)."""
+    num_labels: int = 0
+    """Regions that coseg looks for (0: as many as are stable over seeds)."""
+    labels: Path | None = None
+    """Label maps made elsewhere, to be checked, coloured and drawn; wins over --segmenter."""
+    resize_labels: bool = False
+    """Take label maps of another size than their image, resized to it; otherwise that is an error."""
+    ignore_labels: str = ""
+    """Labels that are to form no areas, comma-separated names or ids; labels.json keeps them for `match`."""
+    overlay_size: int = 1200
+    """Long side of an overlay in pixels (0: no overlays)."""
+    device: str = "auto"
+    """auto, cpu, cuda, cuda:1, ..."""
+    threads: int = 0
+    """CPU threads (0: all cores)."""
+    seed: int = 0
+    """Seed of everything random."""
+    verbose: bool = False
+    """Show the log on the terminal."""
+
+
 NOT_IN_RESULTS = frozenset(
     {"images", "pairs", "cameras", "output", "config", "threads", "verbose"}
     | {"refine_intrinsics", "mapper", "mapping", "keypoints"}

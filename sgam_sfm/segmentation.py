@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import PIL.Image
 
@@ -14,11 +13,9 @@ from sgam_sfm.inputs import read_images
 from sgam_sfm.label_maps import create_segmenter, write_label_maps
 from sgam_sfm.label_set import LabelSet
 from sgam_sfm.machine import use_threads
+from sgam_sfm.options import SegmentOptions
 from sgam_sfm.pictures.overlay import draw_labels
 from sgam_sfm.progress import Stages
-
-if TYPE_CHECKING:
-    from sgam_sfm.commands.segment import SegmentOptions
 
 
 def segment_collection(options: SegmentOptions, stages: Stages) -> LabelSet:

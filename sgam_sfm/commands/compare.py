@@ -2,35 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
 from rich.console import Console
 
+from sgam_sfm.comparison.options import CompareOptions
 from sgam_sfm.exit_codes import DONE
 from sgam_sfm.logs import logging_to
-from sgam_sfm.options import MatchOptions
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareOptions(MatchOptions):
-    """Several methods on the same photos, pairs, cameras and mapping options, side by side.
-
-    A method is area-matcher:point-matcher[@option=value,...], or sift (COLMAP's own SIFT on the same pairs).
-    none:xfeat-star@budget=match matches as many pixels as sgam:xfeat-star does. Options of `match` mean the same here.
-    Writes OUT/<method>/ (all of its output), OUT/compare.json and a table.
-    """
-
-    methods: tuple[str, ...]
-    """For example: sgam:xfeat-star none:xfeat-star none:xfeat-star@budget=match sift."""
-    ground_truth: Path | None = None
-    """Known poses: Strecha's cameras, a ScanNet scene, a COLMAP model, a CSV, ...; matched by image name."""
-    repeats: int = 1
-    """Runs with different seeds; differences within their spread are ties."""
-    max_pairs: int = 0
-    """Match only this many pairs, evenly over the list (0: all)."""
-    max_image_size: int = 4096
-    """The longest side of a whole image that memory allows a method with a budget."""
 
 
 def run(options: CompareOptions, console: Console) -> int:

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic_core import to_jsonable_python
 from rich.console import Console
@@ -15,6 +15,7 @@ from rich.console import Console
 from sgam_sfm import registry
 from sgam_sfm.comparison.figures import FIGURES, TIMES, Figure, Spread, figures_of, over_seeds, times_of, verdict
 from sgam_sfm.comparison.methods import Method, budget_reference, parse_methods
+from sgam_sfm.comparison.options import CompareOptions
 from sgam_sfm.comparison.running import Job, run_apart
 from sgam_sfm.evaluation.ground_truth import GroundTruth, read_ground_truth
 from sgam_sfm.files import write_json
@@ -27,9 +28,6 @@ from sgam_sfm.pairs import write_pairs
 from sgam_sfm.progress import Stages
 from sgam_sfm.summary import versions
 from sgam_sfm.tables import print_figures
-
-if TYPE_CHECKING:
-    from sgam_sfm.commands.compare import CompareOptions
 
 VERSION = 1
 _log = logging.getLogger(__name__)

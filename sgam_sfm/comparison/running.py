@@ -13,13 +13,13 @@ from typing import Any
 from sgam_core import match_whole
 from sgam_sfm import registry
 from sgam_sfm.comparison.budget import Budget, fit_budget
-from sgam_sfm.comparison.match_cache import CachedMatcher
 from sgam_sfm.comparison.methods import Method
 from sgam_sfm.database import write_database
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import read_inputs
 from sgam_sfm.logs import logging_to
 from sgam_sfm.mapping import VerificationOptions, match_sift
+from sgam_sfm.match_cache import CachedMatcher
 from sgam_sfm.matching import CollectionMatcher
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.progress import Stages

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import inf
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic_core import to_jsonable_python
@@ -17,23 +17,21 @@ from sgam_core import AreaMatcher, Matches, match_whole
 from sgam_core.errors import InputError
 from sgam_core.options import changed
 from sgam_sfm import registry
-from sgam_sfm.comparison.match_cache import CachedMatcher
 from sgam_sfm.evaluation.ground_truth import GroundTruth, TrueView, read_ground_truth
 from sgam_sfm.evaluation.metrics import area_matching_precision, pose_auc
+from sgam_sfm.evaluation.options import EvaluateOptions
 from sgam_sfm.evaluation.two_view import PIXELS, JudgedPair, TruePair, judge_pair, overlaps, true_pair
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import LabelMaps, make_label_maps
 from sgam_sfm.machine import find_device, use_threads
+from sgam_sfm.match_cache import CachedMatcher
 from sgam_sfm.matching import CollectionMatcher
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
 from sgam_sfm.progress import Stages
 from sgam_sfm.runner import create_matcher
 from sgam_sfm.summary import versions
-
-if TYPE_CHECKING:
-    from sgam_sfm.commands.evaluate import EvaluateOptions
 
 VERSION = 1
 _AMP_OVERLAP = 0.7

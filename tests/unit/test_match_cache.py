@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sgam_core import Box, Crop, Image, Matches
-from sgam_sfm.comparison.match_cache import CachedMatcher
+from sgam_sfm.match_cache import CachedMatcher
 
 
 class Counting:
