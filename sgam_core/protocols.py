@@ -27,7 +27,10 @@ class PointMatcher(Protocol):
 
 @runtime_checkable
 class AreaMatcher(Protocol):
-    """Finds areas of two images that show the same thing (AM in the paper)."""
+    """Finds areas of two images that show the same thing (AM in the paper).
+
+    Areas are cropped by `sgam_core.crops.area_crop`, unless the area matcher has a method `crop(image, box, options)`.
+    """
 
     @property
     def needs_labels(self) -> bool:

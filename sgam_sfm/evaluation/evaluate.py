@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import logging
+import difflib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import inf
+from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -14,28 +15,29 @@ import numpy as np
 from pydantic_core import to_jsonable_python
 
 from sgam_core import AreaMatcher, Matches, match_whole
-from sgam_core.errors import InputError
+from sgam_core.errors import InputError, OptionError
 from sgam_core.options import changed
 from sgam_sfm import registry
 from sgam_sfm.evaluation.ground_truth import GroundTruth, TrueView, read_ground_truth
 from sgam_sfm.evaluation.metrics import area_matching_precision, pose_auc
 from sgam_sfm.evaluation.options import EvaluateOptions
-from sgam_sfm.evaluation.two_view import PIXELS, JudgedPair, TruePair, judge_pair, overlaps, true_pair
+from sgam_sfm.evaluation.presets import PRESETS, frame_pairs
+from sgam_sfm.evaluation.two_view import PIXELS, JudgedPair, TruePair, areas_of, judge_pair, true_pair
 from sgam_sfm.files import write_json
+from sgam_sfm.images import list_images
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import LabelMaps, make_label_maps
 from sgam_sfm.machine import find_device, use_threads
 from sgam_sfm.match_cache import CachedMatcher
 from sgam_sfm.matching import CollectionMatcher
 from sgam_sfm.options import MatchOptions
-from sgam_sfm.pairs import Pair
+from sgam_sfm.pairs import Pair, write_pairs
 from sgam_sfm.progress import Stages
 from sgam_sfm.runner import create_matcher
 from sgam_sfm.summary import versions
 
 VERSION = 1
 _AMP_OVERLAP = 0.7
-_log = logging.getLogger(__name__)
 
 _OFF = {"prediction__enabled": False, "rejection__rule": "none", "collection__rule": "none"}
 _ABLATION: Mapping[str, Mapping[str, Any]] = {
@@ -71,12 +73,14 @@ def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
 
     Returns: the content of evaluate.json. Raises: SGAMError for what cannot be used at all.
     """
+    options = with_dataset(options)
     common = replace(options.matching, device=str(find_device(options.device, "--device")))
     use_threads(common.threads)
     truth = read_ground_truth(options.ground_truth, options.ground_truth_format or None, common.images)
+    common = replace(common, pairs=_listed(options, truth))
     inputs = read_inputs(common, stages)
     names = truth.match_names(inputs.images)
-    pairs = _pairs(inputs, truth, names, options)
+    pairs = _known(inputs.pairs.pairs, truth, names, options.max_pairs)
     variants = _variants(common, ablation=options.ablation)
     needs_labels = any(_area_matcher(variant.options).needs_labels for variant in variants)
     labels = make_label_maps(common, inputs.images, stages) if needs_labels else None
@@ -132,16 +136,18 @@ def figures_of(pairs: Sequence[JudgedPair], auc_degrees: Sequence[float]) -> dic
     areas = pose_auc([pair.pose_error_deg for pair in pairs], auc_degrees)
     figures |= {f"auc_{degrees:g}": 100 * area for degrees, area in zip(auc_degrees, areas, strict=True)}
     for name, chosen in (
-        ("soa", overlaps(pairs, kind="object", stage="putative")),
-        ("sia", overlaps(pairs, kind="intersection", stage="putative")),
-        ("gp", overlaps(pairs, stage="predicted")),
-        ("all", overlaps(pairs)),
-        ("after_gr", overlaps(pairs, kept=True)),
+        ("soa", areas_of(pairs, kind="object", stage="putative")),
+        ("sia", areas_of(pairs, kind="intersection", stage="putative")),
+        ("gp", areas_of(pairs, stage="predicted")),
+        ("all", areas_of(pairs)),
+        ("after_gr", areas_of(pairs, kept=True)),
     ):
-        known = [overlap for overlap in chosen if not np.isnan(overlap)]
         figures[f"areas_{name}"] = len(chosen) / len(pairs)
-        figures[f"aor_{name}"] = 100 * fmean(known) if known else None
-        figures[f"amp_{name}"] = 100 * area_matching_precision(known, _AMP_OVERLAP) if known else None
+        # The paper reports the one way; both ways also tell an area that is too large for its partner.
+        for way, values in (("", [o.mean for o in chosen]), ("_one_way", [o.forward for o in chosen])):
+            known = [value for value in values if not np.isnan(value)]
+            figures[f"aor_{name}{way}"] = 100 * fmean(known) if known else None
+            figures[f"amp_{name}{way}"] = 100 * area_matching_precision(known, _AMP_OVERLAP) if known else None
     figures["fallbacks"] = 100 * fmean(bool(pair.fallback) for pair in pairs)
     figures["megapixels_matched"] = fmean(pair.pixels_matched for pair in pairs) / 1e6
     return figures
@@ -159,24 +165,54 @@ def _area_matcher(options: MatchOptions, ignored: Sequence[int] = ()) -> AreaMat
     return matcher
 
 
-def _pairs(inputs: Inputs, truth: GroundTruth, names: Mapping[str, str], options: EvaluateOptions) -> list[Pair]:
-    """The pairs that were asked for, or published with the truth, or all; of those, the ones whose pose is known."""
-    asked = inputs.pairs.pairs
-    if options.pairs is None and truth.pairs is not None:
-        by_view = {view: name for name, view in names.items()}
-        asked = tuple((by_view[a], by_view[b]) for a, b in truth.pairs if a in by_view and b in by_view)
-    known = [
-        (a, b) for a, b in asked if a in names and b in names and truth.relative_pose(names[a], names[b]) is not None
-    ]
+def with_dataset(options: EvaluateOptions) -> EvaluateOptions:
+    """The options with the sizes, angles and format of a data set, as the paper has them.
+
+    Raises: OptionError for an unknown data set.
+    """
+    if not options.dataset:
+        return options
+    if options.dataset not in PRESETS:
+        near = difflib.get_close_matches(options.dataset, PRESETS, n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise OptionError(f"--dataset '{options.dataset}' is unknown; {hint}known: {', '.join(PRESETS)}")
+    preset = PRESETS[options.dataset]
+    return replace(
+        options,
+        crop=replace(options.crop, area_size=preset.area_size),
+        auc_degrees=preset.auc_angles,
+        ground_truth_format=preset.format,
+    )
+
+
+def _listed(options: EvaluateOptions, truth: GroundTruth) -> Path | None:
+    """The pair list: the one that was given, else frames so far apart, else the one published with the truth."""
+    if options.pairs is not None or (truth.pairs is None and not options.frame_difference):
+        return options.pairs
+    names, _ = list_images(options.images)
+    if options.frame_difference:
+        pairs = frame_pairs(names, options.frame_difference, options.max_pairs or None)
+    else:
+        by_view = {view: name for name, view in truth.match_names(names).items()}
+        pairs = tuple((by_view[a], by_view[b]) for a, b in truth.pairs or () if a in by_view and b in by_view)
+    path = options.output / "pairs.txt"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_pairs(path, pairs)
+    return path
+
+
+def _known(pairs: Sequence[Pair], truth: GroundTruth, names: Mapping[str, str], wanted: int) -> list[Pair]:
+    """The pairs whose pose is known; at most `wanted` of them (0: all), evenly over the list."""
+    in_truth = [(a, b) for a, b in pairs if a in names and b in names]
+    known = [(a, b) for a, b in in_truth if truth.relative_pose(names[a], names[b]) is not None]
     if not known:
         raise InputError(
-            f"none of the {len(asked)} pairs has a known pose in '{truth.source}' ({truth.format}); its images are "
-            f"named like '{min(truth.views, default='-')}', those of the folder like '{min(inputs.images)}'"
+            f"none of the {len(pairs)} pairs has a known pose in '{truth.source}' ({truth.format}); its images are "
+            f"named like '{min(truth.views, default='-')}', the first pair is '{pairs[0][0]}' - '{pairs[0][1]}'"
         )
-    if options.max_pairs and len(known) > options.max_pairs:
-        rows = np.linspace(0, len(known) - 1, options.max_pairs).round().astype(int)
-        known = [known[row] for row in rows]
-    return known
+    if not wanted or len(known) <= wanted:
+        return known
+    return [known[row] for row in np.linspace(0, len(known) - 1, wanted).round().astype(int)]
 
 
 def _views(truth: GroundTruth, names: Mapping[str, str], pair: Pair) -> tuple[TrueView, TrueView]:

@@ -20,6 +20,10 @@ class EvaluateOptions(MatchOptions):
     """Known poses, and depth where there is some: Strecha's cameras, a ScanNet scene, a COLMAP model, a CSV, ..."""
     ground_truth_format: str = ""
     """Its format, where it cannot be told from the files."""
+    dataset: str = ""
+    """One of the paper's data sets: its area size, angles and format (see docs/datasets.md)."""
+    frame_difference: int = 0
+    """Without --pairs: pairs of video frames whose numbers are so far apart (0: the published list, or all pairs)."""
     ablation: bool = False
     """Judge SOA, SIA, both, +GP, +GR, +GP+GR and all of it, and the paper's own rules: the paper's table."""
     max_pairs: int = 0

@@ -178,10 +178,12 @@ def _frame(view: TrueView) -> Box:
     return Box(x0=0, y0=0, x1=view.width, y1=view.height)
 
 
-def overlaps(pairs: Sequence[JudgedPair], *, kind: str = "", stage: str = "", kept: bool | None = None) -> list[float]:
-    """Mean-of-both-ways overlap of all areas of a kind, a stage, and an outcome; all of them by default."""
+def areas_of(
+    pairs: Sequence[JudgedPair], *, kind: str = "", stage: str = "", kept: bool | None = None
+) -> list[AreaOverlap]:
+    """The overlaps of all areas of a kind, a stage, and an outcome; of all areas by default."""
     return [
-        area.overlap.mean
+        area.overlap
         for pair in pairs
         for area in pair.areas
         if (not kind or area.kind == kind) and (not stage or area.stage == stage) and kept in (None, area.kept)

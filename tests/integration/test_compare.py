@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sgam_sfm import cli
-from sgam_sfm.exit_codes import DONE, USAGE
+from sgam_sfm.exit_codes import DONE, ERROR, USAGE
 from sgam_sfm.scene import write_ground_truth
 from tests.room import Room, write_room
 
@@ -119,3 +119,34 @@ def test_evaluate_judges_matches_poses_and_areas(folder, tmp_path):
     full = next(variant for variant in content["variants"] if variant["name"] == "full")
     assert sum(part["num_pairs"] for part in full["slices"] if part["by"] == "rotation, degrees") == 3
     assert {"area matching", "point matching", "GP", "GR", "GMC"} <= set(full["seconds"])
+
+
+def test_evaluate_takes_frames_that_are_so_far_apart_and_the_angles_of_a_data_set(folder, tmp_path):
+    output = tmp_path / "out"
+    command = ["evaluate", *common(folder, output), "--area-matcher", "none", "--frame-difference", "2"]
+    assert (
+        cli.run([*command, "--dataset", "matterport3d", "--ground-truth-format", "colmap"]) == ERROR
+    )  # its own format
+    assert cli.run(command) == DONE
+    content = json.loads((output / "evaluate.json").read_text())
+    pairs = [tuple(pair["pair"]) for pair in content["variants"][0]["pairs"]]
+    assert pairs == [("view02.jpg", "view04.jpg"), ("view03.jpg", "view05.jpg")]
+
+
+def test_evaluate_without_a_known_pose_says_how_names_differ(folder, tmp_path, capsys):
+    images = tmp_path / "images"
+    images.mkdir()
+    for number, name in enumerate(("view02.jpg", "view03.jpg")):
+        (images / f"other{number}.jpg").symlink_to(folder / "images" / name)
+    command = ["--images", str(images), "--ground-truth", str(folder / "truth"), "--output", str(tmp_path / "out")]
+    assert cli.run(["evaluate", *command, "--area-matcher", "none"]) == ERROR
+    error = capsys.readouterr().err
+    assert "none of the 1 pairs has a known pose in" in error
+    assert "its images are named like 'view02.jpg', the first pair is 'other0.jpg' - 'other1.jpg'" in error
+
+
+def test_an_unknown_data_set_is_told_with_the_nearest(folder, tmp_path, capsys):
+    assert cli.run(["evaluate", *common(folder, tmp_path / "out"), "--dataset", "scanet"]) == USAGE
+    assert (
+        "--dataset 'scanet' is unknown; did you mean 'scannet'? known: scannet, scannet1500" in capsys.readouterr().err
+    )
