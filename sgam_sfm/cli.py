@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import errno
 import os
 import sys
@@ -79,6 +80,11 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _parse(arguments: Sequence[str]) -> Any:
+    known = list(_COMMANDS.values())
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in known:
+        near = difflib.get_close_matches(arguments[0], known, n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise OptionError(f"command '{arguments[0]}' is unknown; {hint}known: {', '.join(known)}")
     commands: Any = Annotated[MatchOptions, tyro.conf.subcommand("match", default=_defaults(arguments, MatchOptions))]
     for options, name in _COMMANDS.items():
         if options in _NEEDED:

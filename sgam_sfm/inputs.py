@@ -100,8 +100,7 @@ def read_images(folder: Path, output: Path, stages: Stages) -> FoundImages:
 
     Raises: OptionError when results would go into the folder; InputError when it holds no image.
     """
-    if output.resolve().is_relative_to(folder.resolve()):
-        raise OptionError(f"--output '{output}' lies in the image folder; choose one outside of it")
+    refuse_among_images(output, folder)
     names, num_other_files = list_images(folder)
     images: dict[str, ImageFile] = {}
     failed: dict[str, str] = {}
@@ -119,6 +118,12 @@ def read_images(folder: Path, output: Path, stages: Stages) -> FoundImages:
 def _check_any(images: Mapping[str, ImageFile], failed: Mapping[str, str], folder: Path) -> None:
     if not images:
         raise InputError(f"none of the {len(failed)} images in '{folder}' can be used: {min(failed.values())}")
+
+
+def refuse_among_images(output: Path, folder: Path) -> None:
+    """Results among the images would be taken for images. Raises: OptionError."""
+    if output.resolve().is_relative_to(folder.resolve()):
+        raise OptionError(f"--output '{output}' lies in the image folder; choose one outside of it")
 
 
 def same_content(images: Iterable[ImageFile]) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
@@ -23,6 +24,7 @@ from sgam_sfm.options import MatchOptions, SegmentOptions
 from sgam_sfm.progress import Stages
 from sgam_sfm.segmenters.protocol import Segmenter
 
+_log = logging.getLogger(__name__)
 _MAX_LABELS_OF_IMAGE = 1000  # areas are counted label by label
 
 
@@ -93,6 +95,7 @@ def write_label_maps(
         for file, made in segmenter.segment(tuple(images.values()), advance):
             if isinstance(made, Exception):
                 failed[file.name] = str(made)
+                _log.warning("%s", made)
                 continue
             labels = layout_labels(made)
             counts = dict(zip(*(part.tolist() for part in np.unique(labels, return_counts=True)), strict=True))
@@ -107,20 +110,20 @@ def write_label_maps(
     given: LabelSet = getattr(segmenter, "label_set", LabelSet())
     known = {label.id: label for label in given.labels}
     total = max(sum(pixels.values()), 1)
-    labels_found = tuple(
+    # Labels that no image has are kept with their names: to mask cars is no mistake where there are none.
+    labels_known = tuple(
         Label(
             id=label_id,
             name=known[label_id].name if label_id in known else "",
             colour="#{:02x}{:02x}{:02x}".format(*distinct_colour(label_id)),
-            share=round(count / total, 6),
+            share=round(pixels[label_id] / total, 6),
         )
-        for label_id, count in sorted(pixels.items())
-        if label_id != 0
+        for label_id in sorted({*pixels, *known} - {0})
     )
-    everything = LabelSet(segmenter=name, labels=(*labels_found, *given.labels))  # names may be absent from the images
+    everything = LabelSet(segmenter=name, labels=labels_known)
     found = LabelSet(
         segmenter=name,
-        labels=labels_found,
+        labels=labels_known,
         ignored=tuple(sorted({*given.ignored, *everything.ids(ignored, "--ignore-labels")})),
         failed=failed,
         facts=_facts(segmenter),

@@ -61,13 +61,17 @@ class LabelSet:
         return tuple(self._id(text.strip(), flag) for text in wanted.split(",") if text.strip())
 
     def _id(self, text: str, flag: str) -> int:
-        if text.isdecimal():
-            return int(text)
         if text.lower() in self.names:
             return self.names[text.lower()]
+        ids = sorted(label.id for label in self.labels)
+        known = f" from {ids[0]} to {ids[-1]}" if ids else ""
+        if text.isdecimal():
+            if ids and int(text) not in ids:
+                raise OptionError(f"{flag} '{text}' is no label; ids are{known}, see labels.json")
+            return int(text)
+        if all(part.isdecimal() for part in text.split()):
+            raise OptionError(f"{flag} '{text}': separate labels by commas, '{','.join(text.split())}'")
         if not self.names:
-            ids = [label.id for label in self.labels]
-            known = f" from {min(ids)} to {max(ids)}" if ids else ""
             raise OptionError(f"{flag} '{text}': labels of '{self.segmenter}' have no names; give ids{known}")
         near = difflib.get_close_matches(text.lower(), self.names, n=1)
         hint = f"did you mean '{near[0]}'? " if near else ""

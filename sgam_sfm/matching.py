@@ -89,7 +89,7 @@ class CollectionMatcher:
         reason = next((failed[name] for name in pair if name in failed), "")
         if reason:
             whole = match_described(image0, image1, None, None, WholeImages(), self._point_matcher, self._options.sgam)
-            return replace(whole, fallback=f"no label map: {reason}")
+            return replace(whole, fallback=f"no usable label map: {reason}")
         described = (self._description(pair[0]), self._description(pair[1]))
         return match_described(image0, image1, *described, self._area_matcher, self._point_matcher, self._options.sgam)
 

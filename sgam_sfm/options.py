@@ -32,6 +32,7 @@ from sgam_sfm.keypoints import KeypointOptions
 
 Preset = Literal["default", "paper", "scannet", "outdoor"]
 _STAGES = tuple(stage.name for stage in fields(SGAMOptions))
+_CROP = tuple(option.name for option in fields(CropOptions))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +70,7 @@ class MatchOptions:
     """Folder of label maps, <image name>.png with ids of 8 or 16 bits (made by `sgam-sfm segment` or elsewhere); wins
     over --segmenter. Its labels.json, when there is one, gives them names."""
     resize_labels: bool = False
-    """Take label maps of another size than their image, resized to it; otherwise that is an error."""
+    """Take label maps of another size than their image, resized to it; otherwise such images count as failed."""
     ignore_labels: str = ""
     """Labels that form no areas, comma-separated names or ids: sky,person,12."""
     mask_matches: str = ""
@@ -154,7 +155,7 @@ class SegmentOptions:
     labels: Path | None = None
     """Label maps made elsewhere, to be checked, coloured and drawn; wins over --segmenter."""
     resize_labels: bool = False
-    """Take label maps of another size than their image, resized to it; otherwise that is an error."""
+    """Take label maps of another size than their image, resized to it; otherwise such images count as failed."""
     ignore_labels: str = ""
     """Labels that are to form no areas, comma-separated names or ids; labels.json keeps them for `match`."""
     overlay_size: int = 1200
@@ -186,6 +187,7 @@ def starting_options(config: Path | None, preset: str | None) -> MatchOptions:
     Raises: OptionError for a file that cannot be used, naming it, or an unknown preset.
     """
     content = read_config(config) if config else {}
+    _group_crop(content)
     made_by = content.pop(VERSION, version("sgam-sfm"))
     content.pop(_FINGERPRINT, None)
     try:
@@ -197,6 +199,12 @@ def starting_options(config: Path | None, preset: str | None) -> MatchOptions:
             raise
         other = "" if made_by == version("sgam-sfm") else f"; it was written by sgam-sfm {made_by}, not this version"
         raise OptionError(f"--config '{config}': {error}{other}") from error
+
+
+def _group_crop(content: dict[str, Any]) -> None:
+    """Options of crops stand at the top level, as their flags do, or under `crop`, as in options.json."""
+    for key in [key for key in content if key.replace("-", "_") in _CROP]:
+        content.setdefault("crop", {})[key] = content.pop(key)
 
 
 def with_preset(options: MatchOptions, preset: str) -> MatchOptions:
@@ -215,6 +223,8 @@ def read_config(path: Path) -> dict[str, Any]:
 
     Raises: OptionError when it is missing or neither.
     """
+    if not path.is_file():
+        raise OptionError(f"--config '{path}' does not exist; give a TOML or JSON file")
     try:
         text = path.read_text(encoding="utf-8-sig")
         content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
@@ -235,7 +245,8 @@ def merged(options: Any, changes: Mapping[str, Any], where: str = "") -> Any:
     for key, value in changes.items():
         name = key.replace("-", "_")
         if name not in types:
-            near = difflib.get_close_matches(name, types, n=1)
+            top = _CROP if "crop" in types else ()
+            near = difflib.get_close_matches(name, [*types, *top], n=1)
             hint = f"; did you mean '{where}{near[0]}'?" if near else ""
             raise OptionError(f"option '{where}{key}' is unknown{hint}")
         current = getattr(options, name, None)

@@ -227,17 +227,21 @@ def find_plain(results: Results, pair: Pair) -> Results | None:
     """The plain matcher's output for a pair among the folders beside a run: same images, same matcher."""
     if results.options.get("area_matcher") == "none":
         return None
+    candidates = []
     for path in sorted(results.folder.resolve().parent.glob("*/options.json")):
         options = _json(path)
         same = options.get("area_matcher") == "none" and options.get("matcher") == results.options.get("matcher")
         if same and Path(options.get("images", "")).resolve() == Path(results.options["images"]).resolve():
-            try:
-                plain = open_results(path.parent, results.images)
-                found = plain.result(pair)
-            except InputError:  # nobody asked for this folder
-                continue
-            if found is not None:
-                return plain
+            others = sum(options.get(name) != value for name, value in results.options.items())
+            candidates.append((others, path.parent))
+    for _, folder in sorted(candidates):  # with the fewest other options first
+        try:
+            plain = open_results(folder, results.images)
+            found = plain.result(pair)
+        except InputError:  # nobody asked for this folder
+            continue
+        if found is not None:
+            return plain
     return None
 
 

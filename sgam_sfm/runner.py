@@ -20,6 +20,7 @@ from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.keypoints import merge_keypoints
 from sgam_sfm.label_maps import make_label_maps
+from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import find_device, peak_memory_mb, use_threads
 from sgam_sfm.mapping import (
     MappingOptions,
@@ -122,9 +123,11 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
     if path.exists():
         before = _read_options(path)
         if before.get("fingerprint") != mark:
-            raise OptionError(
-                f"'{options.output}' was begun with other {difference(before, now)}; choose a new --output folder"
-            )
+            if any((options.output / "pairs").glob("*.h5")):
+                raise OptionError(
+                    f"'{options.output}' was begun with other {difference(before, now)}; choose a new --output folder"
+                )
+            (options.output / "labels" / RECORD).unlink(missing_ok=True)  # nothing is matched yet: begin anew
     write_json(path, now)
     write_json(
         options.output / "inputs.json",

@@ -46,6 +46,9 @@ def read_status(output: Path) -> RunStatus:
     inputs = _read_json(output / "inputs.json") or {}
     fallbacks: Counter[str] = Counter()
     failed: dict[str, str] = {}
+    for pair in inputs.get("left_out", ()):
+        reasons = (inputs["failed"][name] for name in pair if name in inputs["failed"])
+        failed[" - ".join(pair)] = next(reasons, "one of its images cannot be used")
     done = 0
     for outcome in read_pair_outcomes(output):
         done += not outcome.error
@@ -58,7 +61,7 @@ def read_status(output: Path) -> RunStatus:
         images=len(inputs["images"]) if inputs else None,
         failed_images=inputs.get("failed", {}),
         labels=sum(1 for _ in (output / "labels").rglob("*.png")),
-        pairs=len(inputs["pairs"]) if inputs else None,
+        pairs=len(inputs["pairs"]) + len(inputs.get("left_out", ())) if inputs else None,
         pairs_done=done,
         failed_pairs=failed,
         fallbacks=dict(sorted(fallbacks.items())),

@@ -106,6 +106,8 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     if summary["labels"].get("num_labels_chosen"):
         stability = summary["labels"]["stability"][str(summary["labels"]["num_labels_chosen"])]
         table.add_row("labels", f"{summary['labels']['num_labels_chosen']}, runs agree by {stability:.2f}")
+    if summary["labels"].get("failed"):
+        table.add_row("labels", f"{len(summary['labels']['failed'])} images have none that can be used (log.txt)")
     if pairs["areas"]:
         kept = sum(count for name, count in pairs["areas"].items() if name.endswith("_kept"))
         gain = pairs["mean_resolution_gain"]
@@ -115,9 +117,11 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
             f"{sum(n for k, n in pairs['areas'].items() if k.endswith('_rejected'))} rejected; "
             f"{pairs['mean_coverage']:.0%} of the image, {gain:.1f}x the resolution",
         )
-        table.add_row(
-            "fallbacks", ", ".join(f"{count} {reason}" for reason, count in pairs["fallbacks"].items()) or "none"
-        )
+    if summary["labels"]:
+        told = ", ".join(f"{count} pairs: {reason}" for reason, count in pairs["fallbacks"].items())
+        table.add_row("fallbacks", f"matched as whole images: {told}" if told else "none")
+    if pairs["pairs_with_limits"]:
+        table.add_row("limits", f"reached in {pairs['pairs_with_limits']} pairs (`sgam-sfm show` tells which)")
     table.add_row("matches", f"{pairs['raw_matches']} raw, {summary['keypoints']['matches']} as tracks")
     for number, model in enumerate(models):
         table.add_row(

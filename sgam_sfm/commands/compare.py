@@ -12,8 +12,11 @@ from sgam_sfm.logs import logging_to
 def run(options: CompareOptions, console: Console) -> int:
     """Compare; print the table."""
     from sgam_sfm.comparison.compare import compare, print_table
+    from sgam_sfm.comparison.report import write_report
 
     with logging_to(options.output / "log.txt", console, verbose=options.verbose):
         content = compare(options, console)
+        report = write_report(options.output, content)
     print_table(content, console)
+    console.print(f"report     {report}", highlight=False, markup=False, soft_wrap=True)
     return DONE

@@ -14,7 +14,7 @@ class CompareOptions(MatchOptions):
 
     A method is area-matcher:point-matcher[@option=value,...], or sift (COLMAP's own SIFT on the same pairs).
     none:xfeat-star@budget=match matches as many pixels as sgam:xfeat-star does. Options of `match` mean the same here.
-    Writes OUT/<method>/ (all of its output), OUT/compare.json and a table.
+    Writes OUT/<method>/ (all of its output), OUT/compare.json and OUT/report.html.
     """
 
     methods: tuple[str, ...]

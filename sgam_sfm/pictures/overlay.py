@@ -25,12 +25,14 @@ def draw_labels(
     picture = PIL.Image.fromarray(tinted(resized(pixels, size), small, strength=0.4))
     draw = PIL.ImageDraw.Draw(picture)
     font = PIL.ImageFont.load_default(size=max(long_side // 50, 12))
-    for label in np.unique(small):
-        region = (small == label).astype(np.uint8)
-        if label == 0 or region.mean() < _MIN_SHARE:
-            continue
-        inside = cv2.distanceTransform(cv2.copyMakeBorder(region, 1, 1, 1, 1, cv2.BORDER_CONSTANT), cv2.DIST_L2, 5)
-        y, x = np.unravel_index(inside.argmax(), inside.shape)
-        text = f"{label} {names.get(int(label), '')}".strip()
-        draw.text((int(x), int(y)), text, "white", font, "mm", stroke_width=2, stroke_fill="black")
+    for label in np.unique(small[small > 0]):
+        _, parts, stats, _ = cv2.connectedComponentsWithStats((small == label).astype(np.uint8))
+        for part in range(1, len(stats)):
+            if stats[part, cv2.CC_STAT_AREA] < _MIN_SHARE * small.size:
+                continue
+            region = cv2.copyMakeBorder((parts == part).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT)
+            inside = cv2.distanceTransform(region, cv2.DIST_L2, 5)
+            y, x = np.unravel_index(inside.argmax(), inside.shape)
+            text = f"{label} {names.get(int(label), '')}".strip()
+            draw.text((int(x), int(y)), text, "white", font, "mm", stroke_width=2, stroke_fill="black")
     return np.asarray(picture)

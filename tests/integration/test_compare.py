@@ -67,6 +67,7 @@ def test_every_method_has_its_figures_and_its_price(compared):
         assert figures["center_error"] < 0.05
         assert method["times"]["matching_seconds"]["mean"] > 0
         assert (compared / method["slug"] / "database.db").exists()
+    assert "sgam:xfeat-star" in (compared / "report.html").read_text(encoding="utf-8")
     sgam, plain, covisible, _ = content["methods"]
     assert sgam["figures"]["megapixels_matched"]["mean"] > plain["figures"]["megapixels_matched"]["mean"]
     assert sgam["verdicts"]["points"] == "gain"

@@ -138,7 +138,7 @@ def test_bad_images_and_labels_are_counted_and_lose_nothing_else(room, folder, t
     assert summary["images"]["other_files"] == 1
     assert summary["pairs"]["of_unusable_images"] == 5
     assert summary["pairs"]["matched"] == 10
-    assert summary["pairs"]["fallbacks"]["no label map"] == 7
+    assert summary["pairs"]["fallbacks"]["no usable label map"] == 7
     assert sorted(summary["labels"]["failed"]) == names[1:3]
     assert "10x10" in summary["labels"]["failed"][names[2]]
 
@@ -173,7 +173,7 @@ ONE_LINE_ERRORS = {
     "camera": (["--camera-params", "1,2"], "camera model SIMPLE_RADIAL has 4 parameters"),
     "masks": (["--mask-path", "{tmp}/masks"], "--mask-path '{tmp}/masks' does not exist"),
     "labels": (["--labels", "{tmp}/labels"], "--labels '{tmp}/labels' does not exist"),
-    "config": (["--config", "{tmp}/c.toml"], "--config '{tmp}/c.toml' cannot be used"),
+    "config": (["--config", "{tmp}/c.toml"], "--config '{tmp}/c.toml' does not exist"),
 }
 
 
@@ -203,6 +203,18 @@ def test_pair_lists_are_checked(folder, tmp_path, capsys, line, expected):
     given = ["match", "--images", str(folder / "images"), "--output", str(tmp_path / "out"), "--pairs", str(pairs)]
     assert cli.run(given) == ERROR
     assert expected in capsys.readouterr().err
+
+
+def test_an_unknown_command_is_told_with_the_nearest(capsys):
+    assert cli.run(["mach", "--images", "photos"]) == USAGE
+    assert "command 'mach' is unknown; did you mean 'match'? known: match, compare," in capsys.readouterr().err
+
+
+def test_a_refused_output_among_the_images_leaves_nothing_there(folder, capsys):
+    inside = folder / "images" / "out"
+    assert cli.run(["match", "--images", str(folder / "images"), "--output", str(inside)]) == USAGE
+    assert not inside.exists()
+    capsys.readouterr()
 
 
 def test_a_missing_flag_is_a_usage_error(capsys):

@@ -150,6 +150,8 @@ def test_masking_by_labels_works_for_whole_images_too(room, folder, tmp_path):
 def test_a_misspelt_label_is_a_usage_error(folder, tmp_path, capsys, flag):
     assert cli.run(matching(folder, tmp_path / "out", flag, "wal")) == USAGE
     assert f"{flag} 'wal' is no label; did you mean 'wall'? known: book, cabinet" in capsys.readouterr().err
+    # Nothing is matched yet, so that the corrected command may use the same folder.
+    assert cli.run([*matching(folder, tmp_path / "out", flag, "wall"), "--area-matcher", "none"]) == DONE
 
 
 def test_a_damaged_labels_json_is_named(folder, tmp_path, capsys):

@@ -15,7 +15,7 @@ NAMED = LabelSet(labels=(Label(id=3, name="Sky"), Label(id=12, name="traffic lig
 
 @pytest.mark.parametrize(
     ("wanted", "expected"),
-    [("", ()), ("sky", (3,)), ("SKY, traffic light", (3, 12)), ("7,sky,", (7, 3)), ("99", (99,))],
+    [("", ()), ("sky", (3,)), ("SKY, traffic light", (3, 12)), ("7,sky,", (7, 3))],
 )
 def test_names_and_ids_become_ids(wanted, expected):
     assert NAMED.ids(wanted, "--ignore-labels") == expected
@@ -34,6 +34,16 @@ def test_names_for_labels_that_have_none():
     assert str(error.value) == "--mask-matches 'sky': labels of 'coseg' have no names; give ids from 1 to 14"
     with pytest.raises(OptionError, match=r"have no names; give ids$"):
         LabelSet().ids("sky", "--mask-matches")
+
+
+def test_numbers_that_no_label_has_and_lists_without_commas():
+    with pytest.raises(OptionError) as error:
+        NAMED.ids("99", "--mask-matches")
+    assert str(error.value) == "--mask-matches '99' is no label; ids are from 3 to 12, see labels.json"
+    with pytest.raises(OptionError) as error:
+        NAMED.ids("3 7", "--ignore-labels")
+    assert str(error.value) == "--ignore-labels '3 7': separate labels by commas, '3,7'"
+    assert LabelSet().ids("99", "--mask-matches") == (99,)  # nothing is known of these labels
 
 
 def test_a_folder_without_a_record_says_nothing(tmp_path):

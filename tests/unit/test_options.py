@@ -56,6 +56,14 @@ def test_toml_with_dashes_and_a_preset_below_it(tmp_path):
     assert starting_options(path, "paper").collection.min_coverage == 0.3
 
 
+def test_crop_options_stand_at_the_top_as_their_flags_do(tmp_path):
+    assert starting_options(written(tmp_path, "image-size = 1600\n", "c.toml"), None).crop.image_size == 1600
+    with pytest.raises(OptionError, match=r"option 'image-sizee' is unknown; did you mean 'image_size'\?$"):
+        starting_options(written(tmp_path, "image-sizee = 1600\n", "c.toml"), None)
+    with pytest.raises(OptionError, match=r"no.toml' does not exist; give a TOML or JSON file$"):
+        starting_options(tmp_path / "no.toml", None)
+
+
 def test_written_options_read_back_and_have_absolute_paths(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options = MatchOptions(images=Path("photos"), output=Path("out"), weights=Path("outdoor"), seed=5)
