@@ -82,10 +82,11 @@ def test_one_seed_gives_one_result_but_for_times(folder, compared, tmp_path):
 
 
 def test_started_again_it_runs_nothing_that_is_there(folder, compared):
-    databases = {path: path.stat().st_mtime_ns for path in compared.glob("*/database.db")}
+    summaries = {path: path.stat().st_mtime_ns for path in compared.glob("*/summary.json")}  # of the runs
+    assert len(summaries) == len(METHODS)
     before = without_times(content_of(compared))
     assert cli.run(["compare", *common(folder, compared), "--methods", *METHODS]) == DONE
-    assert databases == {path: path.stat().st_mtime_ns for path in compared.glob("*/database.db")}
+    assert summaries == {path: path.stat().st_mtime_ns for path in compared.glob("*/summary.json")}
     assert without_times(content_of(compared)) == before
 
 
