@@ -16,7 +16,8 @@ def run(options: CompareOptions, console: Console) -> int:
 
     with logging_to(options.output / "log.txt", console, verbose=options.verbose):
         content = compare(options, console)
-        report = write_report(options.output, content)
     print_table(content, console)
-    console.print(f"report     {report}", highlight=False, markup=False, soft_wrap=True)
+    if options.report:
+        report = write_report(options.output, content)
+        console.print(f"report     {report}", highlight=False, markup=False, soft_wrap=True)
     return DONE

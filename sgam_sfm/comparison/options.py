@@ -25,5 +25,7 @@ class CompareOptions(MatchOptions):
     """Runs with different seeds; differences within their spread are ties."""
     max_pairs: int = 0
     """Match only this many pairs, evenly over the list (0: all)."""
+    report: bool = True
+    """Write OUT/report.html."""
     max_image_size: int = 4096
     """The longest side of a whole image that memory allows a method with a budget."""

@@ -77,7 +77,8 @@ def test_every_method_has_its_figures_and_its_price(compared):
 
 
 def test_one_seed_gives_one_result_but_for_times(folder, compared, tmp_path):
-    assert cli.run(["compare", *common(folder, tmp_path / "out"), "--methods", *METHODS]) == DONE
+    assert cli.run(["compare", *common(folder, tmp_path / "out"), "--no-report", "--methods", *METHODS]) == DONE
+    assert not (tmp_path / "out" / "report.html").exists()
     assert without_times(content_of(tmp_path / "out")) == without_times(content_of(compared))
 
 
@@ -85,7 +86,7 @@ def test_started_again_it_runs_nothing_that_is_there(folder, compared):
     summaries = {path: path.stat().st_mtime_ns for path in compared.glob("*/summary.json")}  # of the runs
     assert len(summaries) == len(METHODS)
     before = without_times(content_of(compared))
-    assert cli.run(["compare", *common(folder, compared), "--methods", *METHODS]) == DONE
+    assert cli.run(["compare", *common(folder, compared), "--no-report", "--methods", *METHODS]) == DONE
     assert summaries == {path: path.stat().st_mtime_ns for path in compared.glob("*/summary.json")}
     assert without_times(content_of(compared)) == before
 
