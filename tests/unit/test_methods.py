@@ -58,7 +58,7 @@ def test_an_option_that_match_does_not_have():
     with pytest.raises(OptionError) as error:
         method.applied(COMMON, Path("x"), 0)
     assert str(error.value) == (
-        "method 'none:xfeat-star@imagesize=3': option 'imagesize' is unknown; did you mean 'images'?"
+        "method 'none:xfeat-star@imagesize=3': option 'imagesize' is unknown; did you mean 'image_size'?"
     )
 
 
