@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import errno
 import os
 import sys
@@ -27,6 +26,7 @@ from sgam_sfm.comparison.options import CompareOptions
 from sgam_sfm.evaluation.options import EvaluateOptions
 from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED, MEANINGS, USAGE
 from sgam_sfm.files import disk_is_full
+from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.options import MatchOptions, SegmentOptions, starting_options
 
 _COMMANDS = {
@@ -82,8 +82,7 @@ def run(arguments: Sequence[str]) -> int:
 def _parse(arguments: Sequence[str]) -> Any:
     known = list(_COMMANDS.values())
     if arguments and not arguments[0].startswith("-") and arguments[0] not in known:
-        near = difflib.get_close_matches(arguments[0], known, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(arguments[0], known)
         raise OptionError(f"command '{arguments[0]}' is unknown; {hint}known: {', '.join(known)}")
     commands: Any = Annotated[MatchOptions, tyro.conf.subcommand("match", default=_defaults(arguments, MatchOptions))]
     for options, name in _COMMANDS.items():

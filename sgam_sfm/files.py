@@ -26,10 +26,12 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Dataclasses, paths and plain values as JSON."""
+def write_json(path: Path, content: Any) -> Any:
+    """Dataclasses, paths and plain values as JSON. Returns: the content as it is read back."""
+    text = json.dumps(to_jsonable_python(content), indent=2)
     with replacing(path) as partial:
-        partial.write_text(json.dumps(to_jsonable_python(content), indent=2) + "\n", encoding="utf-8")
+        partial.write_text(text + "\n", encoding="utf-8")
+    return json.loads(text)
 
 
 def require_space(path: Path, num_bytes: int) -> None:

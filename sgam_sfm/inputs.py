@@ -33,6 +33,11 @@ class Inputs:
     pairs: PairList
     num_same_content: int = 0
 
+    @property
+    def digests(self) -> dict[str, str]:
+        """Of the images' files, by name."""
+        return {name: file.digest for name, file in self.images.items()}
+
 
 def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
     """Decode the images, read or make the pair list, import the cameras into OUT/cameras.db.

@@ -6,7 +6,6 @@ labels.json             see `LabelSet`; its `labels` alone make a folder of maps
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from sgam_core.errors import InputError, OptionError
 from sgam_sfm.images import ImageFile
+from sgam_sfm.nearest import did_you_mean
 
 RECORD = "labels.json"
 
@@ -73,8 +73,7 @@ class LabelSet:
             raise OptionError(f"{flag} '{text}': separate labels by commas, '{','.join(text.split())}'")
         if not self.names:
             raise OptionError(f"{flag} '{text}': labels of '{self.segmenter}' have no names; give ids{known}")
-        near = difflib.get_close_matches(text.lower(), self.names, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(text.lower(), self.names)
         raise OptionError(f"{flag} '{text}' is no label; {hint}known: {', '.join(sorted(self.names))}")
 
 

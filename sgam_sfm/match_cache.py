@@ -12,6 +12,9 @@ import numpy as np
 
 from sgam_core import Crop, Matches, PointMatcher
 from sgam_sfm.files import replacing
+from sgam_sfm.inputs import Inputs
+from sgam_sfm.matching import create_matcher
+from sgam_sfm.options import MatchOptions
 
 
 @dataclass
@@ -33,6 +36,12 @@ class CachedMatcher:
     charged: float = 0.0
     saved: float = 0.0
     crops: dict[tuple, int] = field(default_factory=dict)
+
+    @staticmethod
+    def of(options: MatchOptions, inputs: Inputs, folder: Path) -> CachedMatcher:
+        """The point matcher of the options, for these images."""
+        key = repr((options.matcher, options.weights, options.mask_path, options.mask_matches, options.labels))
+        return CachedMatcher(create_matcher(options), inputs.digests, key, folder)
 
     def start(self) -> None:
         """Begin to count anew."""

@@ -10,6 +10,7 @@ from typing import Any
 
 from sgam_core import AreaMatcher, Image, PairResult, PointMatcher, WholeImages, match_described
 from sgam_core.errors import SGAMError
+from sgam_sfm import registry
 from sgam_sfm.database import camera_matrix
 from sgam_sfm.images import read_image, read_mask
 from sgam_sfm.inputs import Inputs
@@ -21,6 +22,20 @@ from sgam_sfm.store import PairRecord, PairStore
 
 _log = logging.getLogger(__name__)
 _DESCRIPTIONS_IN_MEMORY = 1024  # about 1 MB each
+
+
+def create_matcher(options: MatchOptions) -> PointMatcher:
+    """The point matcher that the options name."""
+    matcher: PointMatcher = registry.create(
+        "matcher", options.matcher, weights=options.weights, device=options.device, seed=options.seed
+    )
+    return matcher
+
+
+def create_area_matcher(options: MatchOptions, ignored: Collection[int] = ()) -> AreaMatcher:
+    """The area matcher that the options name; ignored: more labels that form no areas."""
+    matcher: AreaMatcher = registry.create("area-matcher", options.area_matcher, options=options.sgam_ignoring(ignored))
+    return matcher
 
 
 def match_blocks(
@@ -48,20 +63,19 @@ def match_blocks(
 class CollectionMatcher:
     """Matches pairs of one collection by name; images are read and described once while they stay in memory.
 
-    masked: labels that nothing is matched in.
+    Raises: OptionError when the options ignore or mask a label that is none.
     """
 
     def __init__(
-        self,
-        options: MatchOptions,
-        inputs: Inputs,
-        labels: LabelMaps | None,
-        masked: Collection[int],
-        area_matcher: AreaMatcher,
-        point_matcher: PointMatcher,
+        self, options: MatchOptions, inputs: Inputs, labels: LabelMaps | None, point_matcher: PointMatcher
     ) -> None:
-        self._options, self._inputs, self._labels, self._masked = options, inputs, labels, masked
-        self._area_matcher, self._point_matcher = area_matcher, point_matcher
+        self._options, self._inputs, self._labels, self._point_matcher = options, inputs, labels, point_matcher
+        ignored: tuple[int, ...] = ()
+        self._masked: tuple[int, ...] = ()
+        if labels is not None:
+            ignored = (*labels.set.ignored, *labels.set.ids(options.ignore_labels, "--ignore-labels"))
+            self._masked = labels.set.ids(options.mask_matches, "--mask-matches")
+        self._area_matcher = create_area_matcher(options, ignored)
         self.image = lru_cache(2 * options.block_images)(self._read_image)  # those of one block
         self._description = lru_cache(_DESCRIPTIONS_IN_MEMORY)(self._describe)
         self.seconds: dict[str, float] = {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import subprocess
 import sys
 import tempfile
@@ -16,6 +15,7 @@ from typing import Literal
 from sgam_core.errors import OptionError, WeightsError
 from sgam_sfm import registry
 from sgam_sfm.files import replacing
+from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.weights import (
     ADE20K,
     COARSE_LOFTR,
@@ -101,8 +101,7 @@ def get_weights(name: str, source: Path | None = None) -> Path:
     """
     cards = {card.name: card for card in CARDS}
     if name not in cards:
-        near = difflib.get_close_matches(name, cards, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(name, cards)
         raise OptionError(f"model '{name}' is unknown; {hint}known: {', '.join(cards)}")
     spec = cards[name].weights
     if spec is None:

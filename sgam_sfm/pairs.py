@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
+import numpy as np
+
 from sgam_core.errors import InputError
 
 Pair = tuple[str, str]
@@ -102,6 +104,13 @@ def all_pairs(names: Sequence[str], max_images: int = 60) -> tuple[Pair, ...]:
             "name the pairs that overlap in a file and pass it with --pairs"
         )
     return tuple(combinations(names, 2))
+
+
+def spread_over(pairs: Sequence[Pair], wanted: int) -> list[Pair]:
+    """At most `wanted` pairs (0: all), evenly over the list."""
+    if not wanted or wanted >= len(pairs):
+        return list(pairs)
+    return [pairs[row] for row in np.linspace(0, len(pairs) - 1, wanted).round().astype(int)]
 
 
 def blocks(pairs: Iterable[Pair], images_per_tile: int = 8) -> tuple[tuple[Pair, ...], ...]:

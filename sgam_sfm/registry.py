@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from sgam_core.errors import OptionError
+from sgam_sfm.nearest import did_you_mean
 
 KINDS = {
     "matcher": "sgam_sfm.matchers",
@@ -26,8 +26,7 @@ def require(kind: str, name: str) -> EntryPoint:
     """The entry point of that name. Raises: OptionError, with the nearest name, when there is none."""
     known = available(kind)
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(name, known)
         raise OptionError(f"--{kind} '{name}' is unknown; {hint}known: {', '.join(known)}")
     return known[name]
 

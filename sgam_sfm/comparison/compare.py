@@ -9,10 +9,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from pydantic_core import to_jsonable_python
 from rich.console import Console
 
-from sgam_sfm import registry
 from sgam_sfm.comparison.figures import FIGURES, TIMES, Figure, Spread, figures_of, over_seeds, times_of, verdict
 from sgam_sfm.comparison.methods import Method, budget_reference, parse_methods
 from sgam_sfm.comparison.options import CompareOptions
@@ -23,8 +21,9 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import create_segmenter, write_label_maps
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import find_device
+from sgam_sfm.matching import create_area_matcher
 from sgam_sfm.options import MatchOptions, fingerprint
-from sgam_sfm.pairs import write_pairs
+from sgam_sfm.pairs import spread_over, write_pairs
 from sgam_sfm.progress import Stages
 from sgam_sfm.summary import versions
 from sgam_sfm.tables import print_figures
@@ -45,7 +44,7 @@ def compare(options: CompareOptions, console: Console) -> dict[str, Any]:
     stages = Stages(console=console)
     inputs = read_inputs(replace(common, output=options.output / "inputs"), stages)
     truth = None if options.ground_truth is None else read_ground_truth(options.ground_truth)
-    pairs = _spread_over(inputs.pairs.pairs, options.max_pairs)
+    pairs = spread_over(inputs.pairs.pairs, options.max_pairs)
     write_pairs(options.output / "pairs.txt", pairs)
     common = replace(common, pairs=options.output / "pairs.txt")
 
@@ -67,8 +66,8 @@ def compare(options: CompareOptions, console: Console) -> dict[str, Any]:
             )
             results[method.slug].append(_run(job, inputs, truth))
     content = _content(options, methods, inputs, len(pairs), truth, results)
-    write_json(options.output / "compare.json", content)
-    return content
+    written: dict[str, Any] = write_json(options.output / "compare.json", content)
+    return written
 
 
 def _labels(
@@ -82,8 +81,8 @@ def _labels(
     """One folder of label maps for all methods of a seed; label maps that were given serve all seeds."""
     if options.labels is not None:
         return options.labels
-    area_matchers = {method.area_matcher for method in methods} - {""}
-    if not any(registry.create("area-matcher", name, options=common.sgam).needs_labels for name in area_matchers):
+    named = {method.area_matcher for method in methods} - {""}
+    if not any(create_area_matcher(replace(common, area_matcher=name)).needs_labels for name in named):
         return None
     folder = options.output / "labels" / f"seed-{seed}"
     if not (folder / RECORD).exists():
@@ -95,8 +94,7 @@ def _labels(
 def _run(job: Job, inputs: Inputs, truth: GroundTruth | None) -> dict[str, Any]:
     """Run a method, unless its result is there already; figures are taken anew, since the truth may be another one."""
     path = job.options.output / "result.json"
-    digests = {name: file.digest for name, file in inputs.images.items()}
-    mark = fingerprint(job.options, images=digests, budget=(job.target, job.max_image_size))
+    mark = fingerprint(job.options, images=inputs.digests, budget=(job.target, job.max_image_size))
     result = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     if result.get("fingerprint") != mark:
         result = run_apart(job) | {"fingerprint": mark}
@@ -108,13 +106,6 @@ def _run(job: Job, inputs: Inputs, truth: GroundTruth | None) -> dict[str, Any]:
         "figures": figures_of(result, folder, truth),
         "times": times_of(result),
     }
-
-
-def _spread_over(pairs: Sequence[tuple[str, str]], wanted: int) -> list[tuple[str, str]]:
-    """At most `wanted` pairs (0: all), evenly over the list."""
-    if not wanted or wanted >= len(pairs):
-        return list(pairs)
-    return [pairs[round(k * (len(pairs) - 1) / max(wanted - 1, 1))] for k in range(wanted)]
 
 
 def _content(
@@ -130,7 +121,7 @@ def _content(
     plain = (method for method in methods if method.area_matcher == "none" and not method.same_budget)
     reference = next(plain, methods[0])
     known = None if truth is None else {"path": str(truth.source), "format": truth.format, "unit": truth.unit}
-    content = {
+    return {
         "version": VERSION,
         "collection": {
             "images": str(options.images.absolute()),
@@ -153,8 +144,6 @@ def _content(
         ],
         "versions": versions(),
     }
-    as_json: dict[str, Any] = to_jsonable_python(content)
-    return as_json
 
 
 def _verdicts(figures: Mapping[str, Spread | None], reference: Mapping[str, Spread | None]) -> dict[str, str]:

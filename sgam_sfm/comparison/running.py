@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -11,20 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from sgam_core import match_whole
-from sgam_sfm import registry
 from sgam_sfm.comparison.budget import Budget, fit_budget
 from sgam_sfm.comparison.methods import Method
 from sgam_sfm.database import write_database
 from sgam_sfm.files import write_json
-from sgam_sfm.inputs import read_inputs
+from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.logs import logging_to
 from sgam_sfm.mapping import VerificationOptions, match_sift
 from sgam_sfm.match_cache import CachedMatcher
-from sgam_sfm.matching import CollectionMatcher
+from sgam_sfm.matching import CollectionMatcher, create_area_matcher
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.progress import Stages
 from sgam_sfm.run_record import recording
-from sgam_sfm.runner import create_matcher, match_collection, reconstruct
+from sgam_sfm.runner import match_collection, reconstruct
 
 _log = logging.getLogger(__name__)
 
@@ -65,11 +63,9 @@ def run_method(job: Job) -> dict[str, Any]:
 def _run_matcher(job: Job, stages: Stages) -> dict[str, Any]:
     options, cap = job.options, ""
     inputs = read_inputs(options, Stages(quiet=True))
-    digests = {name: file.digest for name, file in inputs.images.items()}
-    key = repr((options.matcher, options.weights, options.mask_path, options.mask_matches, options.labels))
-    matcher = CachedMatcher(create_matcher(options), digests, key, job.cache)
+    matcher = CachedMatcher.of(options, inputs, job.cache)
     if job.target:
-        budget = _fitted(job, matcher)
+        budget = _fitted(job, inputs, matcher)
         options, cap = budget.options, budget.cap
         _log.info("%s: %d of %d pixels %s", job.method.name, budget.reached, budget.target, cap)
     matcher.start()
@@ -83,13 +79,12 @@ def _run_matcher(job: Job, stages: Stages) -> dict[str, Any]:
     }
 
 
-def _fitted(job: Job, matcher: CachedMatcher) -> Budget:
+def _fitted(job: Job, inputs: Inputs, matcher: CachedMatcher) -> Budget:
     """The options with which the method matches as many pixels as it may."""
-    inputs = read_inputs(job.options, Stages(quiet=True))
-    area_matcher = registry.create("area-matcher", job.options.area_matcher, options=job.options.sgam)
+    area_matcher = create_area_matcher(job.options)
     whole = {}
     if job.method.area_matcher != "none":
-        collection = CollectionMatcher(job.options, inputs, None, (), area_matcher, matcher)
+        collection = CollectionMatcher(job.options, inputs, None, matcher)
         for name0, name1 in inputs.pairs.pairs:
             images = (collection.image(name0), collection.image(name1))
             whole[name0, name1] = match_whole(*images, matcher, job.options.crop)
@@ -121,7 +116,6 @@ def _run_sift(job: Job, stages: Stages) -> dict[str, Any]:
             "no_model": "" if mapped is None else mapped.reason,
             "seconds": stages.seconds,
         }
-        write_json(options.output / "summary.json", summary)
-        summary = json.loads((options.output / "summary.json").read_text(encoding="utf-8"))
+        summary = write_json(options.output / "summary.json", summary)
     pixels = sum(file.width * file.height for file in inputs.images.values())
     return {"summary": summary, "pixels_extracted": pixels, "saved_seconds": 0.0, "cap": ""}

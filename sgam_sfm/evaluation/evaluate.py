@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -12,12 +11,10 @@ from statistics import fmean
 from typing import Any
 
 import numpy as np
-from pydantic_core import to_jsonable_python
 
-from sgam_core import AreaMatcher, Matches, match_whole
+from sgam_core import Matches, match_whole
 from sgam_core.errors import InputError, OptionError
 from sgam_core.options import changed
-from sgam_sfm import registry
 from sgam_sfm.evaluation.ground_truth import GroundTruth, TrueView, read_ground_truth
 from sgam_sfm.evaluation.metrics import area_matching_precision, pose_auc
 from sgam_sfm.evaluation.options import EvaluateOptions
@@ -29,11 +26,11 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import LabelMaps, make_label_maps
 from sgam_sfm.machine import find_device, use_threads
 from sgam_sfm.match_cache import CachedMatcher
-from sgam_sfm.matching import CollectionMatcher
+from sgam_sfm.matching import CollectionMatcher, create_area_matcher
+from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.options import MatchOptions
-from sgam_sfm.pairs import Pair, write_pairs
+from sgam_sfm.pairs import Pair, spread_over, write_pairs
 from sgam_sfm.progress import Stages
-from sgam_sfm.runner import create_matcher
 from sgam_sfm.summary import versions
 
 VERSION = 1
@@ -82,16 +79,13 @@ def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
     names = truth.match_names(inputs.images)
     pairs = _known(inputs.pairs.pairs, truth, names, options.max_pairs)
     variants = _variants(common, ablation=options.ablation)
-    needs_labels = any(_area_matcher(variant.options).needs_labels for variant in variants)
+    needs_labels = any(create_area_matcher(variant.options).needs_labels for variant in variants)
     labels = make_label_maps(common, inputs.images, stages) if needs_labels else None
-    digests = {name: file.digest for name, file in inputs.images.items()}
-    key = repr((common.matcher, common.weights, common.mask_path, common.mask_matches, common.labels))
-    matcher = CachedMatcher(create_matcher(common), digests, key, common.output / "cache" / "matches")
+    matcher = CachedMatcher.of(common, inputs, common.output / "cache" / "matches")
 
     facts = {}
     whole: dict[Pair, Matches] = {}
-    whole_images = _area_matcher(replace(common, area_matcher="none"))
-    plain = CollectionMatcher(common, inputs, None, (), whole_images, matcher)
+    plain = CollectionMatcher(replace(common, area_matcher="none"), inputs, None, matcher)
     with stages.stage("Matching whole images", len(pairs)) as advance:
         for pair in pairs:
             whole[pair] = match_whole(plain.image(pair[0]), plain.image(pair[1]), matcher, common.crop)
@@ -120,9 +114,8 @@ def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
         ],
         "versions": versions(),
     }
-    write_json(common.output / "evaluate.json", content)
-    as_json: dict[str, Any] = to_jsonable_python(content)
-    return as_json
+    written: dict[str, Any] = write_json(common.output / "evaluate.json", content)
+    return written
 
 
 def figures_of(pairs: Sequence[JudgedPair], auc_degrees: Sequence[float]) -> dict[str, float | None]:
@@ -160,11 +153,6 @@ def _variants(common: MatchOptions, *, ablation: bool) -> list[Variant]:
     return [plain, Variant(name=common.area_matcher, options=common)]
 
 
-def _area_matcher(options: MatchOptions, ignored: Sequence[int] = ()) -> AreaMatcher:
-    matcher: AreaMatcher = registry.create("area-matcher", options.area_matcher, options=options.sgam_ignoring(ignored))
-    return matcher
-
-
 def with_dataset(options: EvaluateOptions) -> EvaluateOptions:
     """The options with the sizes, angles and format of a data set, as the paper has them.
 
@@ -173,8 +161,7 @@ def with_dataset(options: EvaluateOptions) -> EvaluateOptions:
     if not options.dataset:
         return options
     if options.dataset not in PRESETS:
-        near = difflib.get_close_matches(options.dataset, PRESETS, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(options.dataset, PRESETS)
         raise OptionError(f"--dataset '{options.dataset}' is unknown; {hint}known: {', '.join(PRESETS)}")
     preset = PRESETS[options.dataset]
     return replace(
@@ -210,9 +197,7 @@ def _known(pairs: Sequence[Pair], truth: GroundTruth, names: Mapping[str, str], 
             f"none of the {len(pairs)} pairs has a known pose in '{truth.source}' ({truth.format}); its images are "
             f"named like '{min(truth.views, default='-')}', the first pair is '{pairs[0][0]}' - '{pairs[0][1]}'"
         )
-    if not wanted or len(known) <= wanted:
-        return known
-    return [known[row] for row in np.linspace(0, len(known) - 1, wanted).round().astype(int)]
+    return spread_over(known, wanted)
 
 
 def _views(truth: GroundTruth, names: Mapping[str, str], pair: Pair) -> tuple[TrueView, TrueView]:
@@ -231,9 +216,7 @@ def _judge(
     advance: Callable[[float], None],
 ) -> dict[Pair, JudgedPair]:
     options = variant.options
-    ignored = (*labels.set.ignored, *labels.set.ids(options.ignore_labels, "--ignore-labels")) if labels else ()
-    masked = labels.set.ids(options.mask_matches, "--mask-matches") if labels else ()
-    collection = CollectionMatcher(options, inputs, labels, masked, _area_matcher(options, ignored), matcher)
+    collection = CollectionMatcher(options, inputs, labels, matcher)
     judged = {}
     for number, pair in enumerate(pairs):
         matcher.start()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 from matplotlib.figure import Figure
 
 from sgam_core.errors import InputError
@@ -88,11 +90,12 @@ def collection_picture(results: Results) -> Figure:
         raise InputError(f"'{results.folder}' knows of no image yet; start the same run again")
     counts, registered, models = results.counts(), results.registered(), results.models()
     verified = {} if counts is None else counts.inliers
+    partners = Counter(name for pair in verified for name in pair)
     entries = [
         ImageEntry(
             name=name,
             keypoints=None if counts is None else counts.keypoints.get(name, 0),
-            verified=None if counts is None else sum(name in pair for pair in verified),
+            verified=None if counts is None else partners[name],
             model=registered.get(name, "") if models else None,
             error=results.failed.get(name, ""),
         )

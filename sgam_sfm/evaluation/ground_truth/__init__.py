@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 
 from sgam_core.errors import InputError, OptionError
@@ -20,6 +19,7 @@ from sgam_sfm.evaluation.ground_truth import (
     yfcc100m,
 )
 from sgam_sfm.evaluation.ground_truth.types import Format, GroundTruth, TrueView
+from sgam_sfm.nearest import did_you_mean
 
 __all__ = ["FORMATS", "Format", "GroundTruth", "TrueView", "read_ground_truth"]
 
@@ -50,8 +50,7 @@ def read_ground_truth(path: Path, format: str | None = None, images: Path | None
         format.
     """
     if format is not None and format not in FORMATS:
-        near = difflib.get_close_matches(format, FORMATS, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(format, FORMATS)
         raise OptionError(f"ground-truth format '{format}' is unknown; {hint}known: {', '.join(FORMATS)}")
     if not path.exists():
         raise InputError(f"there is no ground truth at '{path}'; give a file or folder")
