@@ -1,4 +1,4 @@
-"""COLMAP's database: import images and cameras, write keypoints and matches, read everything back.
+"""COLMAP's database: import images and cameras, write keypoints and matches.
 
 Pixels have COLMAP's corner origin, as everywhere in this project: nothing is shifted here.
 """
@@ -13,13 +13,13 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from sgam_core.errors import InputError, OptionError, ShapeError, StageError
+from sgam_sfm.colmap_reading import quiet, read_model
 from sgam_sfm.files import replacing, require_space
 from sgam_sfm.pairs import Pair
 
@@ -111,7 +111,7 @@ def import_cameras(
         for group, mode, model, params in _import_groups(names, known, options):
             reader = pycolmap.ImageReaderOptions()
             reader.camera_model, reader.camera_params = model, ",".join(map(repr, params or ()))
-            with _quiet():  # what COLMAP would print about unreadable images is returned as failures
+            with quiet():  # what COLMAP would print about unreadable images is returned as failures
                 pycolmap.import_images(partial, image_folder, mode, group, reader)
         cameras = _read_cameras_of_images(partial, {*known} if options.params is None else {*names})
         failures, sizes = _failures(image_folder, sorted({*names} - {*cameras}))
@@ -192,145 +192,6 @@ def write_database(
                 database.write_matches(ids[pair[0]], ids[pair[1]], np.ascontiguousarray(indices, np.uint32))
 
 
-def read_database(path: Path) -> dict[str, dict]:
-    """Everything in a database as plain values and arrays.
-
-    Returns: `cameras` by id; `images` by name; `keypoints` (N, 2) float32 by name; `matches` (M, 2) uint32 and
-        `two_view_geometries` (config, F, E, H, inlier_matches) by pair, the image with the smaller id first.
-    Raises: InputError when the file is missing or no COLMAP database.
-    """
-    with _opened(path) as database:
-        images = {image.image_id: image for image in database.read_all_images()}
-
-        def pair(pair_id: int) -> Pair:
-            id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
-            return images[id0].name, images[id1].name
-
-        return {
-            "cameras": {
-                camera.camera_id: {
-                    "model": camera.model_name,
-                    "width": camera.width,
-                    "height": camera.height,
-                    "params": np.asarray(camera.params),
-                    "has_prior_focal": camera.has_prior_focal_length,
-                }
-                for camera in database.read_all_cameras()
-            },
-            "images": {
-                image.name: {"image_id": image.image_id, "camera_id": image.camera_id} for image in images.values()
-            },
-            "keypoints": {image.name: database.read_keypoints(image.image_id) for image in images.values()},
-            "matches": {pair(pair_id): indices for pair_id, indices in zip(*database.read_all_matches(), strict=True)},
-            "two_view_geometries": {
-                pair(pair_id): {
-                    "config": pycolmap.TwoViewGeometryConfiguration(geometry.config).name,
-                    **{matrix: getattr(geometry, matrix) for matrix in ("F", "E", "H", "inlier_matches")},
-                }
-                for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True)
-            },
-        }
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DatabaseCounts:
-    """keypoints: their number by image name. inliers: by verified pair, the image with the smaller id first."""
-
-    keypoints: Mapping[str, int]
-    inliers: Mapping[Pair, int]
-
-
-PairInliers = tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K 2"]]
-"""Keypoints (K, 2) of both images in pixels, a row a match."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class ModelImage:
-    """Keypoints of an image in a model. track_lengths: distinct images that see each one's point, 0 without a point."""
-
-    points: Float[np.ndarray, "N 2"]
-    track_lengths: Int[np.ndarray, " N"]
-
-
-def read_counts(path: Path) -> DatabaseCounts:
-    """How many keypoints every image has, and how many inliers every pair that COLMAP verified.
-
-    Raises: InputError when the file is missing or no COLMAP database.
-    """
-    with _opened(path) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-        pairs = zip(*database.read_two_view_geometry_num_inliers(), strict=True)
-        ids = ((pycolmap.pair_id_to_image_pair(pair_id), count) for pair_id, count in pairs if count > 0)
-        return DatabaseCounts(
-            keypoints={name: database.num_keypoints_for_image(image_id) for image_id, name in names.items()},
-            inliers={(names[id0], names[id1]): count for (id0, id1), count in ids},
-        )
-
-
-def read_keypoints(path: Path, name: str) -> Float[np.ndarray, "N 2"] | None:
-    """Keypoints (N, 2) of an image, None when the database does not know it.
-
-    Raises: InputError when the file is missing or no COLMAP database.
-    """
-    with _opened(path) as database:
-        image = database.read_image_with_name(name)
-        return None if image is None else np.asarray(database.read_keypoints(image.image_id)[:, :2], np.float64)
-
-
-def read_pair_inliers(path: Path, pair: Pair) -> PairInliers | None:
-    """The keypoints that COLMAP's verification matched in a pair; None when it has not looked at the pair.
-
-    Raises: InputError when the file is missing or no COLMAP database.
-    """
-    with _opened(path) as database:
-        images = [database.read_image_with_name(name) for name in pair]
-        ids = [image.image_id for image in images if image is not None]
-        if len(ids) < 2 or not database.exists_two_view_geometry(*ids):
-            return None
-        indices = np.asarray(database.read_two_view_geometry(*ids).inlier_matches, np.int64).reshape(-1, 2)
-        points = [np.asarray(database.read_keypoints(image_id)[:, :2], np.float64) for image_id in ids]
-        return points[0][indices[:, 0]], points[1][indices[:, 1]]
-
-
-def read_model_names(folder: Path) -> tuple[str, ...]:
-    """The images with a pose in a model, sorted.
-
-    Raises: InputError when the folder holds no COLMAP model.
-    """
-    model = _model(folder)
-    return tuple(sorted(model.image(image_id).name for image_id in model.reg_image_ids()))
-
-
-def read_model_image(folder: Path, name: str) -> ModelImage:
-    """The keypoints of an image with a pose in a model, and the lengths of their tracks.
-
-    Raises: InputError when the folder holds no COLMAP model, or the model no such image.
-    """
-    model = _model(folder)
-    image = model.find_image_with_name(name)
-    if image is None:
-        raise InputError(f"the model in {folder} has no image '{name}'")
-    tracks = [
-        len({element.image_id for element in model.point3D(point.point3D_id).track.elements})
-        if point.has_point3D()
-        else 0
-        for point in image.points2D
-    ]
-    points = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
-    return ModelImage(points=points, track_lengths=np.array(tracks, np.int64))
-
-
-def database_content(path: Path) -> dict[str, dict]:
-    """`read_database` with lists in place of arrays: two databases are equal when this is."""
-    return _plain(read_database(path))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return {key: _plain(item) for key, item in value.items()} if isinstance(value, dict) else value
-
-
 def _parameters(model: str, params: str | Sequence[float | str] | None) -> tuple[float, ...] | None:
     """The parameters as numbers. Raises: ValueError, with a message for users, when they do not fit the model."""
     if model not in CAMERA_MODELS:
@@ -355,7 +216,7 @@ def _parameters(model: str, params: str | Sequence[float | str] | None) -> tuple
 
 
 def _model_cameras(folder: Path) -> dict[str, KnownCamera]:
-    model = _model(folder)
+    model = read_model(folder)
     cameras = {
         camera_id: KnownCamera(
             model=camera.model_name,
@@ -366,17 +227,6 @@ def _model_cameras(folder: Path) -> dict[str, KnownCamera]:
         for camera_id, camera in model.cameras.items()
     }
     return {image.name: cameras[image.camera_id] for image in model.images.values()}
-
-
-def _model(folder: Path) -> pycolmap.Reconstruction:
-    try:
-        with _quiet():
-            return pycolmap.Reconstruction(folder)
-    except (ValueError, RuntimeError) as error:
-        raise InputError(
-            f"{folder} cannot be read as a COLMAP model ({str(error).splitlines()[0]}); it needs cameras, images and "
-            "points3D as .txt or .bin"
-        ) from error
 
 
 def _listed_cameras(path: Path) -> dict[str, KnownCamera]:
@@ -488,19 +338,6 @@ def _check_matches(pair: Pair, indices: np.ndarray, counts: tuple[int, int]) -> 
             raise ShapeError(f"matches of {pair} use a keypoint of '{pair[side]}' more than once; expected one-to-one")
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[pycolmap.Database]:
-    # COLMAP would create a missing file.
-    if not path.is_file():
-        raise InputError(f"there is no database at {path}")
-    try:
-        database = pycolmap.Database.open(path)
-    except RuntimeError as error:
-        raise InputError(f"{path} is not a COLMAP database") from error
-    with database:
-        yield database
-
-
 def _copy(source: Path, target: Path) -> None:
     """Copy an SQLite file with what is still in its journal."""
     if not source.is_file():
@@ -527,14 +364,3 @@ def _replacing(path: Path) -> Iterator[Path]:
 def _remove_journals(path: Path) -> None:
     for suffix in ("-wal", "-shm", "-journal"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep COLMAP from printing anything short of a fatal error."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level

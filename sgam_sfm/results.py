@@ -14,10 +14,10 @@ from jaxtyping import Int32, UInt8
 
 from sgam_core import AreaMatch, PairResult
 from sgam_core.errors import InputError
-from sgam_sfm.database import (
+from sgam_sfm.colmap_reading import (
     DatabaseCounts,
+    MatchedPoints,
     ModelImage,
-    PairInliers,
     read_counts,
     read_keypoints,
     read_model_image,
@@ -127,7 +127,7 @@ class Results:
         """The names of labels that have one."""
         return {label.id: label.name for label in read_label_set(self.folder / "labels").labels if label.name}
 
-    def inliers(self, pair: Pair) -> PairInliers | None:
+    def inliers(self, pair: Pair) -> MatchedPoints | None:
         """The matches that COLMAP's verification left of a pair, None when it has not verified the pair."""
         database = self.folder / "database.db"
         return read_pair_inliers(database, pair) if database.is_file() else None

@@ -17,8 +17,8 @@ from matplotlib.patheffects import withStroke
 
 from sgam_core.geometry import sampson_distance
 from sgam_core.types import AreaMatch, AreaState, PairResult, TwoViewModel
+from sgam_sfm.colmap_reading import MatchedPoints
 from sgam_sfm.colours import distinct_colour
-from sgam_sfm.database import PairInliers
 from sgam_sfm.pictures.canvas import (
     DISTANCES,
     INK,
@@ -75,7 +75,7 @@ class Matching:
 
     title: str
     result: PairResult
-    inliers: PairInliers | None
+    inliers: MatchedPoints | None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

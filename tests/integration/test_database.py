@@ -10,14 +10,13 @@ import PIL.Image
 import pytest
 
 from sgam_core.errors import InputError, OptionError, ShapeError
+from sgam_sfm.colmap_reading import database_content, read_database
 from sgam_sfm.database import (
     CameraInfo,
     CameraOptions,
     camera_matrix,
-    database_content,
     import_cameras,
     read_cameras,
-    read_database,
     write_database,
 )
 

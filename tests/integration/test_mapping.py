@@ -14,12 +14,11 @@ import pycolmap
 import pytest
 
 from sgam_core.errors import InputError, OptionError, StageError
+from sgam_sfm.colmap_reading import database_content, read_database
 from sgam_sfm.database import (
     CameraOptions,
     ImportedImages,
-    database_content,
     import_cameras,
-    read_database,
     write_database,
 )
 from sgam_sfm.mapping import MappingOptions, VerificationOptions, map_images, verify

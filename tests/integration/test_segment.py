@@ -13,7 +13,7 @@ import pytest
 
 from sgam_core.errors import WeightsError
 from sgam_sfm import cli, registry
-from sgam_sfm.database import database_content
+from sgam_sfm.colmap_reading import database_content
 from sgam_sfm.exit_codes import DONE, ERROR, SOME_FAILED, USAGE
 from sgam_sfm.images import read_label_map
 from sgam_sfm.inputs import read_images

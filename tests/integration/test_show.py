@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from sgam_sfm import cli
-from sgam_sfm.commands import show
-from sgam_sfm.database import (
+from sgam_sfm.colmap_reading import (
     read_counts,
     read_database,
     read_keypoints,
@@ -19,6 +18,7 @@ from sgam_sfm.database import (
     read_model_names,
     read_pair_inliers,
 )
+from sgam_sfm.commands import show
 from sgam_sfm.exit_codes import DONE, ERROR, USAGE
 from sgam_sfm.pictures import image_picture, pair_picture
 from sgam_sfm.results import find_plain, open_results

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float
 
 from sgam_core.errors import InputError
+from sgam_sfm.colmap_reading import read_poses_and_points
 from sgam_sfm.comparison.report.bounds import Bounds, evenly_of
 from sgam_sfm.comparison.report.runs import MethodRun, PairMatches, read_matches
 from sgam_sfm.evaluation.ground_truth import GroundTruth, TrueView, read_ground_truth
@@ -70,12 +70,11 @@ def true_views(known: Mapping[str, Any] | None, names: Collection[str]) -> TrueV
 
 def read_model(folder: Path, bounds: Bounds) -> Model:
     """A COLMAP model, with as many points as are drawn."""
-    model = pycolmap.Reconstruction(folder)
-    images = (model.image(image_id) for image_id in model.reg_image_ids())
-    poses = {image.name: inverse(np.asarray(image.cam_from_world().matrix())) for image in images}
-    ids = sorted(model.points3D)
-    points = np.array([model.points3D[i].xyz for i in evenly_of(ids, bounds.points)], np.float64).reshape(-1, 3)
-    return Model(poses=dict(sorted(poses.items())), points=points, num_points=len(ids))
+    poses, points = read_poses_and_points(folder)
+    drawn = points[evenly_of(range(len(points)), bounds.points)]
+    return Model(
+        poses={name: inverse(pose) for name, pose in poses.items()}, points=drawn.reshape(-1, 3), num_points=len(points)
+    )
 
 
 def aligned(model: Model, target: Mapping[str, np.ndarray]) -> Model | None:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import zlib  # noqa: F401  (before pycolmap, whose wheel carries a zlib of its own)
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float
 
-from sgam_sfm.database import read_counts
+from sgam_sfm.colmap_reading import read_counts, read_match_counts, read_pair_matches
 from sgam_sfm.pairs import Pair
 from sgam_sfm.store import PairRecord, PairStore, read_pair_outcomes, read_pairs_of
 
@@ -97,7 +95,8 @@ def read_matches(folder: Path, wanted: Collection[Pair]) -> Iterator[PairMatches
                 matches = record.result.matches
                 yield _ordered(record.pair, matches.points0, matches.points1)
     elif (folder / "database.db").is_file():
-        yield from _database_matches(folder / "database.db", wanted)
+        for pair, points in read_pair_matches(folder / "database.db", sorted(wanted)):
+            yield PairMatches(pair, *points)
 
 
 def key(pair: Pair) -> Pair:
@@ -119,24 +118,7 @@ def _inliers(database: Path) -> dict[Pair, int]:
 
 
 def _num_matches(database: Path) -> dict[Pair, int]:
-    if not database.is_file():
-        return {}
-    with pycolmap.Database.open(database) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images()}
-        counts = zip(*opened.read_num_matches(), strict=True)
-        ids = ((pycolmap.pair_id_to_image_pair(pair_id), count) for pair_id, count in counts)
-        return {key((names[id0], names[id1])): int(count) for (id0, id1), count in ids}
-
-
-def _database_matches(database: Path, wanted: Collection[Pair]) -> Iterator[PairMatches]:
-    with pycolmap.Database.open(database) as opened:
-        ids = {image.name: image.image_id for image in opened.read_all_images()}
-        for pair in sorted(wanted):
-            if not all(name in ids for name in pair):
-                continue
-            rows = np.asarray(opened.read_matches(ids[pair[0]], ids[pair[1]]), np.int64).reshape(-1, 2)
-            points = [np.asarray(opened.read_keypoints(ids[name])[:, :2], np.float64) for name in pair]
-            yield PairMatches(pair, points[0][rows[:, 0]], points[1][rows[:, 1]])
+    return {key(pair): count for pair, count in read_match_counts(database).items()} if database.is_file() else {}
 
 
 def _ordered(pair: Pair, points0: np.ndarray, points1: np.ndarray) -> PairMatches:
