@@ -136,6 +136,33 @@ def camera_matrix(info: CameraInfo) -> Float[np.ndarray, "3 3"] | None:
     return np.asarray(camera.calibration_matrix(), np.float64)
 
 
+def camera_of_part(
+    info: CameraInfo, origin: tuple[int, int], part: tuple[int, int], size: tuple[int, int]
+) -> KnownCamera:
+    """The camera of a part of an image, resized.
+
+    Args: origin: (x0, y0) of the part in the image. part, size: its (width, height) there and after resizing.
+    """
+    camera = pycolmap.Camera(model=info.model, width=info.width, height=info.height, params=info.params)
+    camera.principal_point_x -= origin[0]
+    camera.principal_point_y -= origin[1]
+    camera.width, camera.height = part
+    camera.rescale(*size)
+    return KnownCamera(
+        model=info.model, params=tuple(map(float, camera.params)), width=camera.width, height=camera.height
+    )
+
+
+def write_cameras(path: Path, cameras: Mapping[str, KnownCamera]) -> None:
+    """Write cameras by image name to a text file that `read_cameras` reads."""
+    lines = (
+        f"{name}\t{camera.model} {camera.width} {camera.height} {' '.join(map(repr, camera.params))}\n"
+        for name, camera in cameras.items()
+    )
+    with replacing(path) as partial:
+        partial.write_text("".join(lines), encoding="utf-8")
+
+
 def read_cameras(path: Path, names: Sequence[str]) -> dict[str, KnownCamera]:
     """Read known cameras: a text file, or a folder with a COLMAP model (text or binary) whose images have our names.
 

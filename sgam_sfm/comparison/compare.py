@@ -12,10 +12,12 @@ from typing import Any
 from rich.console import Console
 
 from sgam_sfm.comparison.figures import FIGURES, TIMES, Figure, Spread, figures_of, over_seeds, times_of, verdict
+from sgam_sfm.comparison.harder import Cut, cut_collection, cut_folder, parse_cut
 from sgam_sfm.comparison.methods import Method, budget_reference, parse_methods
 from sgam_sfm.comparison.options import CompareOptions
 from sgam_sfm.comparison.running import Job, run_apart
 from sgam_sfm.evaluation.ground_truth import GroundTruth, read_ground_truth
+from sgam_sfm.evaluation.sfm_metrics import Poses
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import create_segmenter, write_label_maps
@@ -38,19 +40,25 @@ def compare(options: CompareOptions, console: Console) -> dict[str, Any]:
     Returns: the content of compare.json, see docs/compare.md.
     Raises: SGAMError for what cannot be used at all.
     """
-    methods = parse_methods(options.methods)
+    methods, cut = parse_methods(options.methods), parse_cut(options.hard, options.scene_scale)
     common = MatchOptions(**{field.name: getattr(options, field.name) for field in fields(MatchOptions)})
     common = replace(common, device=str(find_device(options.device, "--device")))
     stages = Stages(console=console)
     inputs = read_inputs(replace(common, output=options.output / "inputs"), stages)
+    if str(cut):
+        common = cut_collection(cut, common, inputs, cut_folder(options.output, cut), stages)
+        inputs = read_inputs(replace(common, output=options.output / "inputs"), stages)
     truth = None if options.ground_truth is None else read_ground_truth(options.ground_truth)
     pairs = spread_over(inputs.pairs.pairs, options.max_pairs)
     write_pairs(options.output / "pairs.txt", pairs)
     common = replace(common, pairs=options.output / "pairs.txt")
+    names = sorted({name for pair in pairs for name in pair})
+    views = {} if truth is None else truth.views_of(names)
+    poses = {name: pose for name, view in views.items() if (pose := view.cam_from_world) is not None}
 
     results: dict[str, list[dict[str, Any]]] = {method.slug: [] for method in methods}
     for seed in range(options.seed, options.seed + options.repeats):
-        labelled = replace(common, labels=_labels(options, common, methods, inputs, seed, stages))
+        labelled = replace(common, labels=_labels(common, options.output, methods, inputs, seed, stages))
         for method in sorted(methods, key=lambda method: method.same_budget):
             folder = options.output / method.slug
             folder = folder / f"seed-{seed}" if seed != options.seed else folder
@@ -64,34 +72,35 @@ def compare(options: CompareOptions, console: Console) -> dict[str, Any]:
                 target=target,
                 max_image_size=options.max_image_size,
             )
-            results[method.slug].append(_run(job, inputs, truth))
-    content = _content(options, methods, inputs, len(pairs), truth, results)
+            results[method.slug].append(_run(job, inputs, poses))
+    content = _content(common.images, cut, methods, names, len(pairs), truth, results)
     written: dict[str, Any] = write_json(options.output / "compare.json", content)
     return written
 
 
 def _labels(
-    options: CompareOptions,
     common: MatchOptions,
+    output: Path,
     methods: Sequence[Method],
     inputs: Inputs,
     seed: int,
     stages: Stages,
 ) -> Path | None:
     """One folder of label maps for all methods of a seed; label maps that were given serve all seeds."""
-    if options.labels is not None:
-        return options.labels
+    if common.labels is not None:
+        return common.labels
     named = {method.area_matcher for method in methods} - {""}
     if not any(create_area_matcher(replace(common, area_matcher=name)).needs_labels for name in named):
         return None
-    folder = options.output / "labels" / f"seed-{seed}"
+    wanted = replace(common, seed=seed)
+    folder = output / "labels" / f"seed-{seed}-{fingerprint(wanted, images=inputs.digests)[:8]}"
     if not (folder / RECORD).exists():
-        segmenter = create_segmenter(replace(common, seed=seed), options.output / "cache" / "segmenter")
-        write_label_maps(segmenter, options.segmenter, inputs.images, folder, stages, full_size=True)
+        segmenter = create_segmenter(wanted, output / "cache" / "segmenter")
+        write_label_maps(segmenter, common.segmenter, inputs.images, folder, stages, full_size=True)
     return folder
 
 
-def _run(job: Job, inputs: Inputs, truth: GroundTruth | None) -> dict[str, Any]:
+def _run(job: Job, inputs: Inputs, true: Poses) -> dict[str, Any]:
     """Run a method, unless its result is there already; figures are taken anew, since the truth may be another one."""
     path = job.options.output / "result.json"
     mark = fingerprint(job.options, images=inputs.digests, budget=(job.target, job.max_image_size))
@@ -103,15 +112,16 @@ def _run(job: Job, inputs: Inputs, truth: GroundTruth | None) -> dict[str, Any]:
     return result | {
         "seed": job.options.seed,
         "folder": str(folder),
-        "figures": figures_of(result, folder, truth),
+        "figures": figures_of(result, folder, true),
         "times": times_of(result),
     }
 
 
 def _content(
-    options: CompareOptions,
+    images: Path,
+    cut: Cut,
     methods: Sequence[Method],
-    inputs: Inputs,
+    names: Sequence[str],
     num_pairs: int,
     truth: GroundTruth | None,
     results: Mapping[str, Sequence[Mapping[str, Any]]],
@@ -124,8 +134,9 @@ def _content(
     return {
         "version": VERSION,
         "collection": {
-            "images": str(options.images.absolute()),
-            "num_images": len(inputs.images),
+            "images": str(images.absolute()),
+            "hard": str(cut),
+            "names": names,
             "num_pairs": num_pairs,
             "ground_truth": known,
         },
@@ -168,7 +179,9 @@ def print_table(content: Mapping[str, Any], console: Console) -> None:
     """Figures down, methods across; green for a gain over the reference, red for a loss, nothing for a tie."""
     methods = content["methods"]
     rows = [(figure.title, [_cell(figure, method) for method in methods]) for figure in (*FIGURES, *TIMES)]
-    print_figures(f"against {content['reference']}", [method["name"] for method in methods], rows, console)
+    hard = content["collection"]["hard"]
+    title = f"against {content['reference']}{f', {hard}' if hard else ''}"
+    print_figures(title, [method["name"] for method in methods], rows, console)
     for method in content["methods"]:
         if method["cap"]:
             console.print(f"{method['name']}: the budget could not be spent, capped at {method['cap']}")

@@ -8,9 +8,9 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any, Literal
 
-from sgam_sfm.evaluation.ground_truth import GroundTruth, read_ground_truth
+from sgam_sfm.colmap_reading import read_poses_and_points
 from sgam_sfm.evaluation.metrics import pose_auc
-from sgam_sfm.evaluation.sfm_metrics import align, camera_errors, pairwise_pose_errors
+from sgam_sfm.evaluation.sfm_metrics import Poses, align, camera_errors, pairwise_pose_errors
 
 AUC_DEGREES = (0.5, 1.0, 3.0, 5.0)
 
@@ -48,10 +48,11 @@ TIMES = (
 """Figures that differ between two runs with one seed."""
 
 
-def figures_of(result: Mapping[str, Any], folder: Path, truth: GroundTruth | None) -> dict[str, float | None]:
+def figures_of(result: Mapping[str, Any], folder: Path, true: Poses) -> dict[str, float | None]:
     """The figures of a run that do not depend on the machine; None for those that there is nothing to take from.
 
-    Args: result: of `running.run_method`. folder: the run's output, for its model. truth: matched by image name.
+    Args: result: of `running.run_method`. folder: the run's output, for its model. true: known poses of the
+        images; those without a pose in the model count as failed.
     """
     summary = result["summary"]
     pairs, models = summary["pairs"], summary["models"]
@@ -69,8 +70,8 @@ def figures_of(result: Mapping[str, Any], folder: Path, truth: GroundTruth | Non
         "megapixels_matched": pairs["pixels_matched"] / 1e6 if "pixels_matched" in pairs else None,
         "megapixels_extracted": result["pixels_extracted"] / 1e6,
     }
-    if truth is not None:
-        figures |= _against_truth(folder / "sparse" / "0" if models else None, truth)
+    if len(true) > 1:
+        figures |= _against_truth(folder / "sparse" / "0" if models else None, true)
     return figures
 
 
@@ -85,25 +86,16 @@ def times_of(result: Mapping[str, Any]) -> dict[str, float | None]:
     }
 
 
-def _against_truth(model: Path | None, truth: GroundTruth) -> dict[str, float | None]:
-    estimated = {} if model is None else _poses(read_ground_truth(model, "colmap"))
-    true = _poses(truth)
-    if len(true) < 2:  # relative poses alone tell nothing of a model
-        return {}
-    names = truth.match_names(estimated)
-    renamed = {names[name]: pose for name, pose in estimated.items() if name in names}
-    errors = [error.max for error in pairwise_pose_errors(renamed, true).values()]
+def _against_truth(model: Path | None, true: Poses) -> dict[str, float | None]:
+    estimated = {} if model is None else read_poses_and_points(model)[0]
+    errors = [error.max for error in pairwise_pose_errors(estimated, true).values()]
     areas = dict(zip((f"auc_{d:g}" for d in AUC_DEGREES), pose_auc(errors, AUC_DEGREES), strict=True))
-    similarity = align(renamed, true)
-    cameras = [] if similarity is None else list(camera_errors(renamed, true, similarity).values())
+    similarity = align(estimated, true)
+    cameras = [] if similarity is None else list(camera_errors(estimated, true, similarity).values())
     return {name: 100 * area for name, area in areas.items()} | {
         "center_error": median(camera.centre for camera in cameras) if cameras else None,
         "rotation_error_deg": median(camera.rotation for camera in cameras) if cameras else None,
     }
-
-
-def _poses(truth: GroundTruth) -> dict[str, Any]:
-    return {name: view.cam_from_world for name, view in truth.views.items() if view.cam_from_world is not None}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

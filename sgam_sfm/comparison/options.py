@@ -23,6 +23,11 @@ class CompareOptions(MatchOptions):
     """Known poses: Strecha's cameras, a ScanNet scene, a COLMAP model, a CSV, ...; matched by image name."""
     repeats: int = 1
     """Runs with different seeds; differences within their spread are ties."""
+    hard: tuple[str, ...] = ()
+    """A harder cut of the photos: every=K (every K-th of them), scale=S (scaled down), zoom=Z (of every other one the
+    centre alone, so that scale changes within pairs)."""
+    scene_scale: float = 1.0
+    """Scale all photos by this before anything else, for a first table in less time."""
     max_pairs: int = 0
     """Match only this many pairs, evenly over the list (0: all)."""
     report: bool = True

@@ -100,6 +100,19 @@ def test_matches_of_crops_are_shared_between_methods(compared):
     assert plain["saved_seconds"] > 0.5 * content["methods"][1]["times"]["matching_seconds"]["mean"]
 
 
+def test_a_harder_cut_keeps_truth_cameras_and_labels_in_agreement(folder, tmp_path):
+    arguments = [*common(folder, tmp_path / "out"), "--methods", "sgam:xfeat-star", "none:xfeat-star"]
+    assert cli.run(["compare", *arguments, "--hard", "zoom=1.25", "--scene-scale", "0.9"]) == DONE
+    content = content_of(tmp_path / "out")
+    assert content["collection"]["hard"] == "scale=0.9 zoom=1.25"
+    for method in content["methods"]:
+        assert method["figures"]["registered"]["mean"] == 4
+        assert method["figures"]["auc_3"]["mean"] > 50
+        assert method["figures"]["reprojection_error_px"]["mean"] < 1.5
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "made harder by <b>scale=0.9 zoom=1.25</b>" in report
+
+
 def test_wrong_methods_are_told_before_anything_runs(folder, tmp_path, capsys):
     assert cli.run(["compare", *common(folder, tmp_path / "out"), "--methods", "sgam:xfeat"]) == USAGE
     assert "method 'sgam:xfeat': --matcher 'xfeat' is unknown; did you mean 'xfeat-star'?" in capsys.readouterr().err

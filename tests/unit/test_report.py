@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from sgam_core.types import Area, AreaMatch, Box, Matches, PairResult
 from sgam_sfm.comparison.figures import FIGURES
+from sgam_sfm.comparison.harder import Window
 from sgam_sfm.comparison.report import Bounds, geometry, plots, table, write_report
 from sgam_sfm.comparison.report.gallery import extremes, make_gallery, thumbnails
 from sgam_sfm.comparison.report.runs import MethodRun, PairFacts, read_matches, read_run
@@ -141,7 +142,8 @@ def write_comparison(output: Path, images: Path, truth: Path | None) -> dict[str
         "version": 1,
         "collection": {
             "images": str(images),
-            "num_images": len(NAMES),
+            "hard": "",
+            "names": sorted(NAMES),
             "num_pairs": 6,
             "ground_truth": None if truth is None else {"path": str(truth), "format": "colmap", "unit": "metres"},
         },
@@ -469,15 +471,23 @@ class TestParts:
         assert run.pairs[pair] == PairFacts(matches=80, inliers=59, coverage=0.375)
         assert list(read_matches(output / "nothing", {pair})) == []
 
-    def test_true_views_of_other_images_count_in_the_curves_alone(self, compared):
+    def test_images_without_a_pose_count_as_failed_in_the_curves(self, compared):
         output, content = compared
-        true = geometry.true_views(content["collection"]["ground_truth"], NAMES[:3])
-        assert (list(true.views), list(true.others), true.missing) == (sorted(NAMES[:3]), [NAMES[3]], "")
+        true = geometry.true_views(content["collection"]["ground_truth"], NAMES)
         model = geometry.read_model(output / "sift" / "sparse" / "0", Bounds())
-        three = geometry.Model(poses={n: model.poses[n] for n in true.views}, points=model.points, num_points=80)
-        errors = geometry.curve_errors(three, {**true.others, **true.views}, Bounds())
+        three = geometry.Model(poses={n: model.poses[n] for n in NAMES[:3]}, points=model.points, num_points=80)
+        errors = geometry.curve_errors(three, true.views, Bounds())
         assert max(errors[:3]) < 0.1
         assert errors[3:] == [180] * 3
+
+    def test_true_cameras_follow_images_that_were_cut(self, compared):
+        known = compared[1]["collection"]["ground_truth"]
+        whole = geometry.true_views(known, NAMES[:1]).views[NAMES[0]]
+        part = (whole.width // 2, whole.height // 2)
+        window = Window(whole=(whole.width, whole.height), x0=10, y0=20, width=part[0], height=part[1], size=part)
+        cut = geometry.true_views(known, NAMES[:1], {NAMES[0]: window}).views[NAMES[0]]
+        assert (cut.width, cut.height) == part
+        np.testing.assert_allclose(whole.camera_matrix[:2, 2] - cut.camera_matrix[:2, 2], [10, 20])
 
     def test_points_far_outside_are_not_drawn(self):
         points = np.concatenate([np.random.default_rng(0).normal(size=(100, 3)), [[1e4, 0, 0]]])

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from sgam_core.errors import InputError
 from sgam_sfm.colmap_reading import read_poses_and_points
+from sgam_sfm.comparison.harder import Window
 from sgam_sfm.comparison.report.bounds import Bounds, evenly_of
 from sgam_sfm.comparison.report.runs import MethodRun, PairMatches, read_matches
 from sgam_sfm.evaluation.ground_truth import GroundTruth, TrueView, read_ground_truth
@@ -44,28 +45,30 @@ class ViewChange:
 class TrueViews(NamedTuple):
     """Cameras with a known pose.
 
-    views: of images, by their names. others: of images that are in no pair, which count as failures in the figures.
-    missing: why there is no view, empty when there are.
+    views: by image name. missing: why there is no view, empty when there are.
     """
 
     views: Mapping[str, TrueView]
-    others: Mapping[str, TrueView]
     missing: str
 
 
-def true_views(known: Mapping[str, Any] | None, names: Collection[str]) -> TrueViews:
-    """The true cameras of images, from what compare.json knows of the truth."""
+def true_views(
+    known: Mapping[str, Any] | None, names: Collection[str], windows: Mapping[str, Window] | None = None
+) -> TrueViews:
+    """The true cameras of images, from what compare.json knows of the truth.
+
+    Args: windows: what is left of the images that the truth knows, where they were cut.
+    """
     if known is None:
-        return TrueViews({}, {}, "no ground truth was given")
+        return TrueViews({}, "no ground truth was given")
     try:
         truth: GroundTruth = read_ground_truth(Path(known["path"]), known["format"])
-        found = truth.match_names(names)
+        found = truth.views_of(names)
     except InputError:
-        return TrueViews({}, {}, "the ground truth is no longer where it was")
-    posed = {name: view for name, view in truth.views.items() if view.cam_from_world is not None}
-    views = {name: posed[view] for name, view in found.items() if view in posed}
-    others = {name: view for name, view in posed.items() if name not in found.values()}
-    return TrueViews(views, others, "" if views else "the ground truth has no pose of these images")
+        return TrueViews({}, "the ground truth is no longer where it was")
+    posed = {name: view for name, view in found.items() if view.cam_from_world is not None}
+    views = {name: windows[name].view(view) if windows else view for name, view in posed.items()}
+    return TrueViews(views, "" if views else "the ground truth has no pose of these images")
 
 
 def read_model(folder: Path, bounds: Bounds) -> Model:

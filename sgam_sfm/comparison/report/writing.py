@@ -12,6 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
+from sgam_sfm.comparison.harder import cut_folder, read_windows
 from sgam_sfm.comparison.report import gallery, geometry, plots, table
 from sgam_sfm.comparison.report.bounds import Bounds, evenly_of
 from sgam_sfm.comparison.report.runs import MethodRun, read_run
@@ -42,8 +43,8 @@ def render(output: Path, content: Mapping[str, Any], bounds: Bounds) -> str:
     images = Path(collection["images"])
     runs = [read_run(output, number, method) for number, method in enumerate(content["methods"])]
     reference = next(run for run in runs if run.content["slug"] == content["reference"])
-    names = sorted({name for run in runs for pair in run.pairs for name in pair})
-    true = geometry.true_views(truth, names)
+    names = collection["names"]
+    true = geometry.true_views(truth, names, read_windows(cut_folder(output, collection["hard"])))
     read = {run.number: geometry.read_model(run.model, bounds) for run in runs if run.model is not None}
     models, unaligned = _aligned(read, reference.number, true.views)
     data = {
@@ -97,8 +98,7 @@ def _pose_curves(
     """Cumulative pose errors of the models; empty without two true views."""
     if len(true.views) < 2:
         return []
-    views = {**true.others, **true.views}
-    errors = {run.number: geometry.curve_errors(models.get(run.number), views, bounds) for run in runs}
+    errors = {run.number: geometry.curve_errors(models.get(run.number), true.views, bounds) for run in runs}
     return plots.pose_curves(errors, bounds)
 
 

@@ -86,6 +86,10 @@ class GroundTruth:
         """The label map of an image, None when there is none."""
         return self.label_files.get(name)
 
+    def views_of(self, names: Iterable[str]) -> dict[str, TrueView]:
+        """The views of images that have one, by image name; see `match_names`."""
+        return {name: self.views[view] for name, view in self.match_names(names).items()}
+
     def match_names(self, names: Iterable[str]) -> dict[str, str]:
         """The view of each image, by image name; images without a view are left out.
 

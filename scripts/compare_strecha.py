@@ -1,0 +1,106 @@
+"""The README's table of methods: SGAM against the same matcher run plainly, at the same price, and against SIFT.
+
+    python scripts/compare_strecha.py DATA OUT [--runs fountain-P11 fountain-P11:every=2 ...] [-- --max-pairs 20 ...]
+
+DATA: a folder with the Strecha scenes (fountain-P11/images, images/K.txt, gt_dense_cameras, ...). Runs `sgam-sfm
+compare` with the true intrinsics held fixed on all pairs of each scene, and on harder cuts of it, into OUT/<run>;
+options after `--` go to all. What is there already is not run again. Prints a Markdown table of all runs that are in
+OUT: gains over the plain matcher at the same input size in bold, losses in italics.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+RUNS = (
+    *(f"{scene}{cut}" for scene in ("Herz-Jesus-P8", "fountain-P11") for cut in ("", ":every=2", ":zoom=2.5")),
+    "castle-P19",
+)
+METHODS = (
+    "sgam:xfeat-star",
+    "none:xfeat-star",
+    "none:xfeat-star@budget=match",
+    "tiles:xfeat-star@budget=match",
+    "covisible:xfeat-star@budget=match",
+    "sift",
+)
+COLUMNS = {
+    "registered": "registered",
+    "auc_0.5": "AUC@0.5",
+    "auc_1": "@1",
+    "auc_3": "@3",
+    "auc_5": "@5",
+    "center_error": "centre mm",
+    "points": "points",
+    "images_per_track": "images a track",
+    "reprojection_error_px": "reproj. px",
+    "verified_pairs": "verified pairs",
+    "megapixels_matched": "Mpx matched",
+    "matching_seconds": "matching s",
+    "peak_memory_mb": "peak MB",
+}
+DIGITS = {"auc_0.5": 1, "auc_1": 1, "auc_3": 1, "auc_5": 1, "center_error": 1, "images_per_track": 2}
+DIGITS |= {"reprojection_error_px": 3}
+
+
+def main() -> None:
+    """Run what is missing, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--runs", nargs="*", default=list(RUNS))
+    parser.add_argument("options", nargs="*")
+    arguments = parser.parse_args()
+    for run in arguments.runs:
+        compare(arguments.data, arguments.out, run, arguments.options)
+    print(table({run: arguments.out / folder_of(run) for run in RUNS}))
+
+
+def compare(data: Path, out: Path, run: str, options: list[str]) -> None:
+    """One comparison."""
+    scene, _, cut = run.partition(":")
+    K = np.loadtxt(data / scene / "images" / "K.txt").reshape(3, 3)
+    params = ",".join(str(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    files = ["--images", data / scene / "images", "--output", out / folder_of(run)]
+    camera = ["--camera-model", "PINHOLE", "--camera-params", params, "--camera-mode", "single"]
+    truth = ["--ground-truth", data / scene / "gt_dense_cameras"]
+    command = [sys.executable, "-m", "sgam_sfm", "compare", *files, *camera, *truth, "--methods", *METHODS, *options]
+    subprocess.run([*map(str, command), *(["--hard", cut] if cut else [])], check=True)
+
+
+def folder_of(run: str) -> str:
+    """The folder of a run, whose name may hold characters that file systems refuse."""
+    return run.replace(":", "_").replace("=", "-")
+
+
+def table(folders: dict[str, Path]) -> str:
+    """Markdown, a row a method and run."""
+    rows = [["run", "method", *COLUMNS.values()], ["---"] * (len(COLUMNS) + 2)]
+    for run, folder in folders.items():
+        if (folder / "compare.json").exists():
+            content = json.loads((folder / "compare.json").read_text())
+            total = len(content["collection"]["names"])
+            for method in content["methods"]:
+                name = method["name"].replace(":xfeat-star", "").replace("=match", "")
+                rows.append([run.replace(":", ", "), name, *(cell(method, figure, total) for figure in COLUMNS)])
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
+def cell(method: dict, figure: str, total: int) -> str:
+    """A figure; empty where the method has none."""
+    found = (method["figures"] | method["times"]).get(figure)
+    if found is None:
+        return ""
+    value = found["mean"] * (1000 if figure == "center_error" else 1)
+    text = f"{value:.0f}/{total}" if figure == "registered" else f"{value:.{DIGITS.get(figure, 0)}f}"
+    return {"gain": f"**{text}**", "loss": f"_{text}_"}.get(method["verdicts"].get(figure, ""), text)
+
+
+if __name__ == "__main__":
+    main()
