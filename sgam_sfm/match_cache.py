@@ -40,7 +40,9 @@ class CachedMatcher:
     @staticmethod
     def of(options: MatchOptions, inputs: Inputs, folder: Path) -> CachedMatcher:
         """The point matcher of the options, for these images."""
-        key = repr((options.matcher, options.weights, options.mask_path, options.mask_matches, options.labels))
+        labels = (options.mask_matches, options.labels, options.segmenter, options.num_labels, options.seed)
+        masks = (options.mask_path, *(labels if options.mask_matches else ()))
+        key = repr((options.matcher, options.weights, masks))
         return CachedMatcher(create_matcher(options), inputs.digests, key, folder)
 
     def start(self) -> None:

@@ -90,7 +90,8 @@ def _labels(
     if common.labels is not None:
         return common.labels
     named = {method.area_matcher for method in methods} - {""}
-    if not any(create_area_matcher(replace(common, area_matcher=name)).needs_labels for name in named):
+    needed = (create_area_matcher(replace(common, area_matcher=name)).needs_labels for name in named)
+    if not common.mask_matches and not any(needed):
         return None
     wanted = replace(common, seed=seed)
     folder = output / "labels" / f"seed-{seed}-{fingerprint(wanted, images=inputs.digests)[:8]}"

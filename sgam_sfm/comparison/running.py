@@ -15,6 +15,7 @@ from sgam_sfm.comparison.methods import Method
 from sgam_sfm.database import write_database
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import Inputs, read_inputs
+from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.logs import logging_to
 from sgam_sfm.mapping import VerificationOptions, match_sift
 from sgam_sfm.match_cache import CachedMatcher
@@ -84,7 +85,9 @@ def _fitted(job: Job, inputs: Inputs, matcher: CachedMatcher) -> Budget:
     area_matcher = create_area_matcher(job.options)
     whole = {}
     if job.method.area_matcher != "none":
-        collection = CollectionMatcher(job.options, inputs, None, matcher)
+        masked = bool(job.options.mask_matches)
+        labels = make_label_maps(job.options, inputs.images, Stages(quiet=True)) if masked else None
+        collection = CollectionMatcher(job.options, inputs, labels, matcher)
         for name0, name1 in inputs.pairs.pairs:
             images = (collection.image(name0), collection.image(name1))
             whole[name0, name1] = match_whole(*images, matcher, job.options.crop)
