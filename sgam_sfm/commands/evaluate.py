@@ -50,7 +50,24 @@ def _print(content: Mapping[str, Any], console: Console) -> None:
         (title, [_cell(variant["figures"].get(name), digits) for variant in variants])
         for name, (title, digits) in (auc | _SHOWN).items()
     ]
-    print_figures(f"{content['num_pairs']} pairs", [variant["name"] for variant in variants], rows, console)
+    names = [variant["name"] for variant in variants]
+    print_figures(f"{content['num_pairs']} pairs", names, rows, console)
+    degrees = content["auc_degrees"][len(content["auc_degrees"]) // 2]
+    parts = zip(*(variant["slices"] for variant in variants), strict=True)  # a slice is the same pairs in all
+    rows = [
+        (
+            f"{of[0]['by']} {of[0]['part']} ({of[0]['num_pairs']})",
+            [_cell(part["figures"][f"auc_{degrees:g}"], 1) for part in of],
+        )
+        for of in parts
+        if of[0]["num_pairs"]
+    ]
+    print_figures(f"AUC@{degrees:g} of the pairs with", names, rows, console)
+    failed = sum(bool(pair["error"]) for pair in variants[0]["pairs"])
+    if failed:
+        console.print(
+            f"{failed} pairs could not be matched and count as failed; evaluate.json says why", style="yellow"
+        )
 
 
 def _cell(value: float | None, digits: int) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sgam_core import Matches, match_whole
-from sgam_core.errors import InputError, OptionError
+from sgam_core.errors import InputError, OptionError, SGAMError
 from sgam_core.options import changed
 from sgam_sfm.evaluation.ground_truth import GroundTruth, TrueView, read_ground_truth
 from sgam_sfm.evaluation.metrics import area_matching_precision, pose_auc
@@ -50,11 +50,16 @@ _ABLATION: Mapping[str, Mapping[str, Any]] = {
 }
 """The paper's table of components, and its own rules of GR and GMC."""
 
-_SLICES: Mapping[str, tuple[Callable[[TruePair], float | None], Sequence[tuple[float, float]]]] = {
-    "rotation, degrees": (lambda pair: pair.angle_deg, ((0, 15), (15, 30), (30, 45), (45, 180))),
+_SLICES: Mapping[str, tuple[Callable[[TruePair], float | str | None], Sequence[tuple[float, float] | str]]] = {
+    "rotation, degrees": (lambda pair: pair.angle_deg, ((0, 15), (15, 30), (30, 45), (45, inf))),
     "scale change": (lambda pair: pair.scale_change, ((1, 1.5), (1.5, 2.5), (2.5, inf))),
-    "overlap": (lambda pair: pair.overlap, ((0, 0.3), (0.3, 0.6), (0.6, 1.01))),
+    "overlap": (lambda pair: pair.overlap, ((0, 0.3), (0.3, 0.6), (0.6, inf))),
+    "place": (lambda pair: pair.place, ("indoor", "outdoor")),
+    "labels in both": (lambda pair: pair.num_labels, ((0, 4), (4, 8), (8, 16), (16, inf))),
 }
+"""What makes a pair hard: a title, its value for a pair, and the slices: names, or ranges without their end."""
+_SHOWN = 0.01
+"""Share of an image that a label must have to be shown by it."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -80,16 +85,21 @@ def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
     pairs = _known(inputs.pairs.pairs, truth, names, options.max_pairs)
     variants = _variants(common, ablation=options.ablation)
     needs_labels = any(create_area_matcher(variant.options).needs_labels for variant in variants)
+    needs_labels |= bool(common.mask_matches)
     labels = make_label_maps(common, inputs.images, stages) if needs_labels else None
     matcher = CachedMatcher.of(common, inputs, common.output / "cache" / "matches")
 
     facts = {}
     whole: dict[Pair, Matches] = {}
-    plain = CollectionMatcher(replace(common, area_matcher="none"), inputs, None, matcher)
+    plain = CollectionMatcher(replace(common, area_matcher="none"), inputs, labels, matcher)
     with stages.stage("Matching whole images", len(pairs)) as advance:
         for pair in pairs:
-            whole[pair] = match_whole(plain.image(pair[0]), plain.image(pair[1]), matcher, common.crop)
-            facts[pair] = true_pair(truth, _views(truth, names, pair), whole[pair])
+            try:
+                whole[pair] = match_whole(plain.image(pair[0]), plain.image(pair[1]), matcher, common.crop)
+            except SGAMError:  # the pair counts as failed in every variant
+                whole[pair] = Matches.empty()
+            true = true_pair(truth, _views(truth, names, pair), whole[pair])
+            facts[pair] = replace(true, num_labels=_num_labels(labels, pair))
             advance(1)
     judged = {}
     for variant in variants:
@@ -221,14 +231,15 @@ def _judge(
     for number, pair in enumerate(pairs):
         matcher.start()
         record = collection.match(pair)
+        advance(1)
         if record.result is None:
-            raise InputError(f"the pair '{pair[0]}' - '{pair[1]}' cannot be matched: {record.error}")
+            judged[pair] = JudgedPair.failed(record.error)
+            continue
         # Results that were looked up are charged with what they cost when they were computed.
         seconds = {**record.result.seconds, "point matching": matcher.charged}
         rng = np.random.default_rng([options.seed, number])
         result = replace(record.result, seconds=seconds)
         judged[pair] = judge_pair(truth, _views(truth, names, pair), result, whole[pair], rng, 500)
-        advance(1)
     return judged
 
 
@@ -244,20 +255,34 @@ def _sliced(
     results: Mapping[Pair, JudgedPair], facts: Mapping[Pair, TruePair], auc_degrees: Sequence[float]
 ) -> list[dict[str, Any]]:
     slices = []
-    for title, (value_of, bounds) in _SLICES.items():
-        for low, high in bounds:
-            chosen = [
-                result
-                for pair, result in results.items()
-                if (value := value_of(facts[pair])) is not None and low <= value < high
-            ]
-            slices.append(
-                {
-                    "by": title,
-                    "from": low,
-                    "to": None if high == inf else high,
-                    "num_pairs": len(chosen),
-                    "figures": figures_of(chosen, auc_degrees),
-                }
-            )
+    for title, (value_of, parts) in _SLICES.items():
+        for part in parts:
+            chosen = [result for pair, result in results.items() if _belongs(value_of(facts[pair]), part)]
+            figures = figures_of(chosen, auc_degrees)
+            slices.append({"by": title, "part": _title(part), "num_pairs": len(chosen), "figures": figures})
     return slices
+
+
+def _belongs(value: float | str | None, part: tuple[float, float] | str) -> bool:
+    if isinstance(part, str) or isinstance(value, str):
+        return value == part
+    return value is not None and part[0] <= value < part[1]
+
+
+def _title(part: tuple[float, float] | str) -> str:
+    if isinstance(part, str):
+        return part
+    return f"{part[0]:g}-{part[1]:g}" if part[1] < inf else f"from {part[0]:g}"
+
+
+def _num_labels(labels: LabelMaps | None, pair: Pair) -> int | None:
+    """Labels that both images show; None without label maps."""
+    if labels is None or not labels.set.failed.keys().isdisjoint(pair):
+        return None
+    shown = (set(np.flatnonzero(_shares(labels.read(name)) >= _SHOWN).tolist()) for name in pair)
+    return len(set.intersection(*shown) - {labels.set.void, *labels.set.ignored})
+
+
+def _shares(labels: np.ndarray) -> np.ndarray:
+    """Share of the pixels by id."""
+    return np.bincount(labels.ravel()) / labels.size

@@ -9,7 +9,7 @@ import numpy as np
 
 from sgam_core import AreaMatch, Matches, PairResult
 from sgam_core.types import AreaState, Box
-from sgam_sfm.evaluation.ground_truth import GroundTruth, TrueView
+from sgam_sfm.evaluation.ground_truth import FORMATS, GroundTruth, TrueView
 from sgam_sfm.evaluation.metrics import (
     AreaOverlap,
     area_overlap,
@@ -34,13 +34,17 @@ class TruePair:
 
     angle_deg: of the relative rotation. overlap: share of what the images show that the other shows too, mean of both
     ways. scale_change: size of a thing in one image over its size in the other, at least 1. approximate: overlap and
-    scale change are of the matches of the whole images, not of depth. None where nothing tells.
+    scale change are of the matches of the whole images, not of depth. place: indoor, outdoor, empty where the format of
+    the truth does not tell. num_labels: that both images show, each on at least 1 % of its pixels. None where nothing
+    tells.
     """
 
     angle_deg: float
     overlap: float | None
     scale_change: float | None
     approximate: bool
+    place: str = ""
+    num_labels: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -59,7 +63,8 @@ class JudgedPair:
 
     precision, precision_640: share of the matches within `PIXELS`, at the image's own pixels and at 640 wide.
     by_depth: share of the matches that depth judged. pose_error_deg: 180 when there is no pose. fallback: as in
-    `PairResult`. pixels_matched: of every point-matcher call. seconds: by stage.
+    `PairResult`. pixels_matched: of every point-matcher call. seconds: by stage. error: why the pair could not be
+    matched; it counts as one without matches and pose.
     """
 
     num_matches: int
@@ -71,6 +76,23 @@ class JudgedPair:
     fallback: str
     pixels_matched: int
     seconds: Mapping[str, float] = field(default_factory=dict)
+    error: str = ""
+
+    @staticmethod
+    def failed(error: str) -> JudgedPair:
+        """A pair that could not be matched."""
+        none = (0.0,) * len(PIXELS)
+        return JudgedPair(
+            num_matches=0,
+            precision=none,
+            precision_640=none,
+            by_depth=0.0,
+            pose_error_deg=180.0,
+            areas=(),
+            fallback="",
+            pixels_matched=0,
+            error=error,
+        )
 
 
 def true_pair(truth: GroundTruth, views: tuple[TrueView, TrueView], whole: Matches) -> TruePair:
@@ -97,6 +119,7 @@ def true_pair(truth: GroundTruth, views: tuple[TrueView, TrueView], whole: Match
         overlap=None if np.isnan(found.mean) else found.mean,
         scale_change=scale,
         approximate=found.approximate,
+        place=FORMATS[truth.format].place,
     )
 
 

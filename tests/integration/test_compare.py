@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import PIL.Image
 import pytest
 
 from sgam_sfm import cli
@@ -133,8 +134,28 @@ def test_evaluate_judges_matches_poses_and_areas(folder, tmp_path):
     assert figures["full"]["amp_after_gr"] >= figures["SOA+SIA"]["amp_all"]
     assert figures["whole images"]["aor_all"] is None
     full = next(variant for variant in content["variants"] if variant["name"] == "full")
-    assert sum(part["num_pairs"] for part in full["slices"] if part["by"] == "rotation, degrees") == 3
+    for by in ("rotation, degrees", "overlap", "labels in both"):
+        assert sum(part["num_pairs"] for part in full["slices"] if part["by"] == by) == 3
+    assert {part["part"]: part["num_pairs"] for part in full["slices"] if part["by"] == "place"} == {
+        "indoor": 0,
+        "outdoor": 0,
+    }
     assert {"area matching", "point matching", "GP", "GR", "GMC"} <= set(full["seconds"])
+
+
+def test_a_pair_that_cannot_be_matched_counts_as_failed(folder, tmp_path, capsys):
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    names = sorted(path.name for path in (folder / "images").iterdir())
+    PIL.Image.new("L", (9, 9), 255).save(masks / f"{names[0]}.png")
+    arguments = [*common(folder, tmp_path / "out"), "--mask-path", str(masks), "--area-matcher", "covisible"]
+    assert cli.run(["evaluate", *arguments]) == DONE
+    assert "3 pairs could not be matched and count as failed" in capsys.readouterr().err
+    for variant in json.loads((tmp_path / "out" / "evaluate.json").read_text())["variants"]:
+        failed = [pair for pair in variant["pairs"] if names[0] in pair["pair"]]
+        assert all(pair["error"].startswith(f"mask of '{names[0]}' is 9x9 but the image is") for pair in failed)
+        assert all(pair["pose_error_deg"] == 180 and pair["num_matches"] == 0 for pair in failed)
+        assert sum(pair["pose_error_deg"] < 5 for pair in variant["pairs"]) >= 2
 
 
 def test_evaluate_takes_frames_that_are_so_far_apart_and_the_angles_of_a_data_set(folder, tmp_path):

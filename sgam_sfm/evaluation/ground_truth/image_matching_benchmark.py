@@ -72,4 +72,5 @@ FORMAT = Format(
     expects="a scene with `images` and `calibration/calibration_<image>.h5` (K, R, T)",
     detects=_detects,
     read=_read,
+    place="outdoor",
 )

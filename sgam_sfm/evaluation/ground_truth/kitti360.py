@@ -71,4 +71,5 @@ FORMAT = Format(
     expects="KITTI-360: calibration/perspective.txt, data_poses and data_2d_raw",
     detects=_detects,
     read=_read,
+    place="outdoor",
 )

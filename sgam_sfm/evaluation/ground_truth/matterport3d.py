@@ -76,4 +76,5 @@ FORMAT = Format(
     expects="MatterPort3D houses: <house>/undistorted_camera_parameters/<house>.conf and undistorted_color_images",
     detects=lambda path: path.is_dir() and bool(_conf_files(path)),
     read=_read,
+    place="indoor",
 )

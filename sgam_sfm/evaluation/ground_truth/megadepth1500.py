@@ -86,4 +86,5 @@ FORMAT = Format(
     expects="a folder with LoFTR's lists 0015_0.1_0.3.npz ... and Undistorted_SfM",
     detects=lambda path: _folder(path) is not None,
     read=_read,
+    place="outdoor",
 )

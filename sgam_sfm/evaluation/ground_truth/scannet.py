@@ -85,4 +85,5 @@ FORMAT = Format(
     expects="a ScanNet scene: folders `color` and `pose`, and `intrinsic` or <scene>.txt",
     detects=lambda path: (path / "color").is_dir() and (path / "pose").is_dir(),
     read=lambda path, images: read_scene(path),
+    place="indoor",
 )

@@ -86,4 +86,5 @@ FORMAT = Format(
     expects="a folder with test.npz of ScanNet1500 and its scenes",
     detects=lambda path: _list_file(path, "test.npz") is not None,
     read=_read,
+    place="indoor",
 )

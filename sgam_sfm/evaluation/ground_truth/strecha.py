@@ -50,4 +50,5 @@ FORMAT = Format(
     expects="a folder `gt_dense_cameras` with a file <image>.camera for each image",
     detects=_detects,
     read=_read,
+    place="outdoor",
 )

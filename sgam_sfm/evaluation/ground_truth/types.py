@@ -119,13 +119,15 @@ class Format:
     """A format of ground truth.
 
     expects: what it looks like, for messages and --help. detects: whether a file or folder looks like it, without
-    reading much. read: (path, folder of the images or None for where the format has them).
+    reading much. read: (path, folder of the images or None for where the format has them). place: where data in this
+    format was taken, empty where it may be anywhere.
     """
 
     name: str
     expects: str
     detects: Callable[[Path], bool]
     read: Callable[[Path, Path | None], GroundTruth]
+    place: Literal["indoor", "outdoor", ""] = ""
 
 
 def _tails_agree(name0: str, name1: str) -> bool:

@@ -35,4 +35,5 @@ FORMAT = Format(
     expects=f"a folder with {_LIST} and OANet's images",
     detects=lambda path: _list_file(path) is not None,
     read=_read,
+    place="outdoor",
 )
