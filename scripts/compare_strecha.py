@@ -55,10 +55,11 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--runs", nargs="*", default=list(RUNS))
-    parser.add_argument("options", nargs="*")
-    arguments = parser.parse_args()
+    own = sys.argv[1:]
+    split = own.index("--") if "--" in own else len(own)
+    arguments = parser.parse_args(own[:split])
     for run in arguments.runs:
-        compare(arguments.data, arguments.out, run, arguments.options)
+        compare(arguments.data, arguments.out, run, own[split + 1 :])
     print(table({run: arguments.out / folder_of(run) for run in RUNS}))
 
 

@@ -13,65 +13,94 @@ from scipy.spatial import cKDTree
 
 _PRIOR_WEIGHT = 0.005  # pull of a keypoint to its own points, against 0.5 for a sure match; a track could drift else
 _NEIGHBOURS = 12  # matches that a local affine map is fitted to
+_EDGES_AT_ONCE = 2**14  # more take more rounds, fewer take more passes over the keypoints
 _AFFINE_ROUNDS = 4  # reweighted least squares settles in three to four
 
 
-class _Tracks:
-    """Union-find over keypoints that also knows the one keypoint of every track in every image."""
+class Tracks:
+    """Tracks of keypoints, each with at most one keypoint in an image; every keypoint is one of its own to begin with.
+
+    points (K, 2), images (K,), sigmas (K,): of the keypoints. radius: matcher pixels within which two keypoints of an
+    image may become one.
+    """
 
     def __init__(self, points: np.ndarray, images: np.ndarray, sigmas: np.ndarray, radius: float) -> None:
-        # Plain lists: single elements of an array cost several times as much to read.
-        self._points, self._images, self._sigmas = points.tolist(), images.tolist(), sigmas.tolist()
-        self._parent = list(range(len(images)))
-        self._members: dict[int, dict[int, int]] = {}  # root -> image -> keypoint; lone keypoints are left out
-        self._radius = radius
-        self._replaced_by = list(range(len(images)))
+        self._points, self._images, self._sigmas, self._radius = points, images, sigmas, radius
+        self._parent = np.arange(len(images))
+        self._replaced_by = np.arange(len(images))
 
-    def root(self, keypoint: int) -> int:
-        parent = self._parent
-        while parent[keypoint] != keypoint:
-            parent[keypoint] = parent[parent[keypoint]]
-            keypoint = parent[keypoint]
-        return keypoint
-
-    def join(self, a: int, b: int, min_shared: int = 0) -> None:
-        """Make one track of those of keypoints a and b, unless that needs one keypoint at two distant spots.
-
-        min_shared: number of images that both tracks must be in.
-        """
-        a, b = self.root(a), self.root(b)
-        if a == b:
-            return
-        members, others = (self._members.get(root) or {self._images[root]: root} for root in (a, b))
-        if len(members) < len(others):
-            a, b, members, others = b, a, others, members
-        shared = [image for image in others if image in members]
-        if len(shared) < min_shared or not all(self._near(members[image], others[image]) for image in shared):
-            return
-        for image, keypoint in others.items():
-            kept = members.setdefault(image, keypoint)
-            if kept != keypoint:
-                if self._sigmas[keypoint] < self._sigmas[kept]:
-                    members[image], kept, keypoint = keypoint, keypoint, kept
-                self._replaced_by[keypoint] = kept
-        self._parent[b] = a
-        self._members[a] = members
-        self._members.pop(b, None)
-
-    def _near(self, a: int, b: int) -> bool:
-        (xa, ya), (xb, yb) = self._points[a], self._points[b]
-        reach = self._radius * max(self._sigmas[a], self._sigmas[b])
-        return bool((xa - xb) ** 2 + (ya - yb) ** 2 <= reach**2)
-
-    def roots(self) -> np.ndarray:
+    def track(self) -> Int[np.ndarray, " K"]:
+        """The keypoint that gives every keypoint's track its number."""
         return _follow(self._parent)
 
-    def representatives(self) -> np.ndarray:
+    def representative(self) -> Int[np.ndarray, " K"]:
+        """The keypoint of the same image and track that each has become part of, itself for most."""
         return _follow(self._replaced_by)
 
+    def join(self, edges: Int[np.ndarray, "E 2"], min_shared: int = 0) -> None:
+        """Make one track of those of each edge's keypoints, unless that needs one keypoint at two distant spots.
 
-def _follow(links: list[int]) -> np.ndarray:
-    target = np.array(links, np.int64)
+        The outcome is that of taking the edges one after the other. Both tracks of an edge are as they will be then as
+        soon as no edge before it touches them, so all such edges are taken at once, round after round.
+
+        min_shared: number of images that both tracks of an edge must be in.
+        """
+        for begin in range(0, len(edges), _EDGES_AT_ONCE):
+            self._join_some(edges[begin : begin + _EDGES_AT_ONCE], min_shared)
+
+    def _join_some(self, edges: np.ndarray, min_shared: int) -> None:
+        self._parent = _follow(self._parent)
+        roots, ends = np.unique(self._parent[edges], return_inverse=True)
+        ends = ends.reshape(-1, 2)  # tracks are numbered by the row of their root from here on
+        number = np.full(len(self._parent), -1)
+        number[roots] = np.arange(len(roots))
+        number = number[self._parent]
+        members = np.flatnonzero((number >= 0) & (self._replaced_by == np.arange(len(number))))
+        track = number[members]
+        parent, first = np.arange(len(roots)), np.empty(len(roots), np.int64)
+        while len(ends := ends[ends[:, 0] != ends[:, 1]]):
+            place = np.arange(len(ends))
+            first[ends[::-1].ravel()] = np.repeat(
+                place[::-1], 2
+            )  # of several the last assignment stays: the first edge
+            now = (first[ends] == place[:, None]).all(axis=1)
+            kept, gone = self._join_apart(ends[now], members, track, len(roots), min_shared)
+            parent[gone] = kept
+            standing = self._replaced_by[members] == members
+            members, track = members[standing], parent[track[standing]]
+            ends = parent[ends[~now]]
+        self._parent[roots] = roots[_follow(parent)]
+
+    def _join_apart(
+        self, edges: np.ndarray, members: np.ndarray, track: np.ndarray, num_tracks: int, min_shared: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Join tracks along edges (E, 2) that have no track in common, where they may be.
+
+        Args: members, track: keypoints that stand for their track in an image, and that track.
+        Returns: the tracks that were joined: those that stay, the larger ones, and those that became part of them.
+        """
+        edge_of = np.full(num_tracks, -1)
+        edge_of[edges] = np.arange(len(edges))[:, None]
+        own = np.flatnonzero(edge_of[track] >= 0)
+        own = own[np.lexsort((self._images[members[own]], edge_of[track[own]]))]
+        edge = edge_of[track[own]]
+        own, at = members[own], track[own]
+        size = np.bincount(at, minlength=num_tracks)[edges]
+        kept, gone = np.where(size[:, :1] >= size[:, 1:], edges, edges[:, ::-1]).T
+        twice = np.flatnonzero((np.diff(edge) == 0) & (np.diff(self._images[own]) == 0))
+        one, other, shared = own[twice], own[twice + 1], edge[twice]
+        reach = self._radius * np.maximum(self._sigmas[one], self._sigmas[other])
+        near = np.linalg.norm(self._points[one] - self._points[other], axis=1) <= reach
+        count = np.bincount(shared, minlength=len(edges))
+        fine = (count >= min_shared) & (np.bincount(shared, near, len(edges)) == count)
+        one, other = np.where(at[twice] == kept[shared], (one, other), (other, one))[:, fine[shared]]
+        stays, goes = np.where(self._sigmas[other] < self._sigmas[one], (other, one), (one, other))
+        self._replaced_by[goes] = stays
+        return kept[fine], gone[fine]
+
+
+def _follow(links: np.ndarray) -> np.ndarray:
+    target = links
     while not np.array_equal(further := target[target], target):
         target = further
     return target
@@ -98,13 +127,12 @@ def link_tracks(
     Returns: track (K,): a number that the keypoints of a track share. representative (K,): the keypoint that each has
         become part of, itself for most; one per track and image.
     """
-    tracks = _Tracks(points, images, sigmas, radius_px)
-    for a, b in edges.tolist():
-        tracks.join(a, b)
+    tracks = Tracks(points, images, sigmas, radius_px)
+    tracks.join(edges)
     if radius_px > 0 and min_shared_images > 0:
-        for a, b in _side_by_side(points, images, sigmas, tracks.roots(), radius_px, min_shared_images).tolist():
-            tracks.join(a, b, min_shared_images)
-    return tracks.roots(), tracks.representatives()
+        roots = tracks.track()
+        tracks.join(_side_by_side(points, images, sigmas, roots, radius_px, min_shared_images), min_shared_images)
+    return tracks.track(), tracks.representative()
 
 
 def _side_by_side(

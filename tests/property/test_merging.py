@@ -1,4 +1,5 @@
 import itertools
+from unittest import mock
 
 import numpy as np
 from hypothesis import given, settings
@@ -6,6 +7,7 @@ from hypothesis import strategies as st
 
 from sgam_core.types import Matches
 from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions, merge_keypoints
+from sgam_sfm.tracks import Tracks
 
 NAMES = ("a", "b", "c", "d")
 
@@ -109,3 +111,44 @@ def test_a_larger_image_with_a_larger_sigma_gives_the_same_tracks(pairs, zoom):
         np.testing.assert_array_equal(merged.matches[pair], rows)
     for name, points in expected.keypoints.items():
         np.testing.assert_allclose(merged.keypoints[name], points * zoom, atol=1e-3 * zoom)
+
+
+def one_after_the_other(points, images, sigmas, edges, radius):
+    """What `_Tracks.join` must come to, edge by edge: track and standing keypoint of every keypoint.
+
+    edges: (a, b, images that both tracks must be in).
+    """
+    root, stands = list(range(len(images))), list(range(len(images)))
+    members = [{image: keypoint} for keypoint, image in enumerate(images.tolist())]
+    for a, b, min_shared in edges:
+        if (a := root[a]) == (b := root[b]):
+            continue
+        a, b = (b, a) if len(members[a]) < len(members[b]) else (a, b)
+        shared = [(members[a][image], members[b][image]) for image in members[a].keys() & members[b].keys()]
+        near = [np.linalg.norm(points[p] - points[q]) <= radius * max(sigmas[p], sigmas[q]) for p, q in shared]
+        if len(shared) < min_shared or not all(near):
+            continue
+        members[a] = members[b] | members[a]
+        for p, q in shared:
+            stays, goes = (q, p) if sigmas[q] < sigmas[p] else (p, q)
+            stands = [stays if keypoint == goes else keypoint for keypoint in stands]
+            members[a][int(images[p])] = stays
+        root = [a if track == b else track for track in root]
+    return root, stands
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_joining_at_once_is_joining_one_after_the_other(seed):
+    rng = np.random.default_rng(seed)
+    count, num_images, num_edges = (int(rng.integers(1, top)) for top in (60, 8, 120))
+    points, images = rng.uniform(0, rng.choice([5, 20, 100]), (count, 2)), rng.integers(0, num_images, count)
+    sigmas, radius = rng.choice([1.0, 1.0, 2.0], count), float(rng.choice([0, 2, 5]))
+    edges, half = rng.integers(0, count, (num_edges, 2)), num_edges // 2
+    made = Tracks(points, images, sigmas, radius)
+    with mock.patch("sgam_sfm.tracks._EDGES_AT_ONCE", int(rng.integers(1, 100))):
+        made.join(edges[:half])
+        made.join(edges[half:], min_shared=1)
+    needed = [(a, b, int(row >= half)) for row, (a, b) in enumerate(edges.tolist())]
+    root, stands = one_after_the_other(points, images, sigmas, needed, radius)
+    np.testing.assert_array_equal(made.track(), root)
+    np.testing.assert_array_equal(made.representative(), stands)
