@@ -3,9 +3,9 @@
     python scripts/compare_strecha.py DATA OUT [--runs fountain-P11 fountain-P11:every=2 ...] [-- --max-pairs 20 ...]
 
 DATA: a folder with the Strecha scenes (fountain-P11/images, images/K.txt, gt_dense_cameras, ...). Runs `sgam-sfm
-compare` with the true intrinsics held fixed on all pairs of each scene, and on harder cuts of it, into OUT/<run>;
-options after `--` go to all. What is there already is not run again. Prints a Markdown table of all runs that are in
-OUT: gains over the plain matcher at the same input size in bold, losses in italics.
+compare` with the true intrinsics held fixed on all pairs of each scene (castle-P19, a walk around a courtyard: each
+image with the next five), and on harder cuts of it, into OUT/<run>; options after `--` go to all. What is there already is not run again. Prints a Markdown table of all runs that are in
+OUT: gains over the plain matcher at the same input size in bold, losses in italics, where the printed figures differ.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ RUNS = (
     *(f"{scene}{cut}" for scene in ("Herz-Jesus-P8", "fountain-P11") for cut in ("", ":every=2", ":zoom=2.5")),
     "castle-P19",
 )
+PARTNERS = {"castle-P19": 5}
 METHODS = (
     "sgam:xfeat-star",
     "none:xfeat-star",
@@ -47,6 +48,7 @@ COLUMNS = {
 }
 DIGITS = {"auc_0.5": 1, "auc_1": 1, "auc_3": 1, "auc_5": 1, "center_error": 1, "images_per_track": 2}
 DIGITS |= {"reprojection_error_px": 3}
+SCALE = {"center_error": 1000}
 
 
 def main() -> None:
@@ -71,6 +73,16 @@ def compare(data: Path, out: Path, run: str, options: list[str]) -> None:
     files = ["--images", data / scene / "images", "--output", out / folder_of(run)]
     camera = ["--camera-model", "PINHOLE", "--camera-params", params, "--camera-mode", "single"]
     truth = ["--ground-truth", data / scene / "gt_dense_cameras"]
+    if scene in PARTNERS:
+        names = sorted(path.name for path in (data / scene / "images").glob("*.jpg"))
+        around = [
+            (a, names[(row + step) % len(names)])
+            for step in range(1, PARTNERS[scene] + 1)
+            for row, a in enumerate(names)
+        ]
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{scene}.txt").write_text("".join(f"{a} {b}\n" for a, b in around))
+        files += ["--pairs", out / f"{scene}.txt"]
     command = [sys.executable, "-m", "sgam_sfm", "compare", *files, *camera, *truth, "--methods", *METHODS, *options]
     subprocess.run([*map(str, command), *(["--hard", cut] if cut else [])], check=True)
 
@@ -87,20 +99,34 @@ def table(folders: dict[str, Path]) -> str:
         if (folder / "compare.json").exists():
             content = json.loads((folder / "compare.json").read_text())
             total = len(content["collection"]["names"])
+            reference = next(m for m in content["methods"] if m["slug"] == content["reference"])
+            plain = cells_of(reference, total)
             for method in content["methods"]:
                 name = method["name"].replace(":xfeat-star", "").replace("=match", "")
-                rows.append([run.replace(":", ", "), name, *(cell(method, figure, total) for figure in COLUMNS)])
+                verdicts = [method["verdicts"].get(figure, "") for figure in COLUMNS]
+                cells = map(marked, cells_of(method, total), plain, verdicts)
+                rows.append([run.replace(":", ", "), name, *cells])
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
-def cell(method: dict, figure: str, total: int) -> str:
-    """A figure; empty where the method has none."""
-    found = (method["figures"] | method["times"]).get(figure)
-    if found is None:
-        return ""
-    value = found["mean"] * (1000 if figure == "center_error" else 1)
-    text = f"{value:.0f}/{total}" if figure == "registered" else f"{value:.{DIGITS.get(figure, 0)}f}"
-    return {"gain": f"**{text}**", "loss": f"_{text}_"}.get(method["verdicts"].get(figure, ""), text)
+def cells_of(method: dict, total: int) -> list[str]:
+    """Every figure as text; empty where the method has none."""
+    found = method["figures"] | method["times"]
+    texts = []
+    for figure in COLUMNS:
+        value = (found.get(figure) or {}).get("mean")
+        if value is None:
+            texts.append("")
+        elif figure == "registered":
+            texts.append(f"{value:.0f}/{total}")
+        else:
+            texts.append(f"{value * SCALE.get(figure, 1):.{DIGITS.get(figure, 0)}f}")
+    return texts
+
+
+def marked(text: str, reference: str, verdict: str) -> str:
+    """A figure as the table shows it."""
+    return text if text == reference else {"gain": f"**{text}**", "loss": f"_{text}_"}.get(verdict, text)
 
 
 if __name__ == "__main__":
