@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import logging
+import os
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 from sgam_core import match_whole
 from sgam_sfm.comparison.budget import Budget, fit_budget
 from sgam_sfm.comparison.methods import Method
 from sgam_sfm.database import write_database
+from sgam_sfm.exit_codes import ERROR
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import make_label_maps
@@ -44,8 +47,24 @@ def run_apart(job: Job) -> dict[str, Any]:
 
     Raises: what `run_method` raises.
     """
-    with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
+    with new_process() as pool:
         return pool.submit(run_method, job).result()
+
+
+def new_process() -> ProcessPoolExecutor:
+    """A process to run one thing in, which ends when this one does, however that ends."""
+    return ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn"), initializer=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(ERROR)
+
+    Thread(target=watch, daemon=True).start()
 
 
 def run_method(job: Job) -> dict[str, Any]:
