@@ -187,7 +187,7 @@ def read_poses_and_points(folder: Path) -> tuple[dict[str, np.ndarray], Float[np
     return poses, np.array(points, np.float64).reshape(-1, 3)
 
 
-def read_observations(folder: Path) -> dict[str, Int[np.ndarray, " P"]]:
+def read_observations(folder: Path) -> dict[str, Int[np.ndarray, " _"]]:
     """The ids of the points that each image with a pose observes in a model, sorted, each once; images by name, sorted.
 
     Raises: InputError when the folder holds no COLMAP model.

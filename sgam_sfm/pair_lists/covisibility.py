@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from sgam_sfm.pair_lists.ranking import ScoreRows
 
 
-def shared_point_scores(points: Sequence[Int[np.ndarray, " P"]]) -> ScoreRows:
+def shared_point_scores(points: Sequence[Int[np.ndarray, " _"]]) -> ScoreRows:
     """The number of points that pairs share.
 
     Args: points: ids of the points that each image observes, each id once in an image.

@@ -12,7 +12,7 @@ from jaxtyping import Int
 from sgam_sfm.pair_lists.ranking import ScoreRows
 
 
-def find_sequences(names: Sequence[str]) -> list[Int[np.ndarray, " F"]]:
+def find_sequences(names: Sequence[str]) -> list[Int[np.ndarray, " _"]]:
     """The rows of the frames of every folder, in the natural order of their names."""
     folders: dict[str, list[int]] = {}
     for row in sorted(range(len(names)), key=lambda row: _natural(names[row])):
@@ -27,7 +27,7 @@ def following(sequence: Int[np.ndarray, " F"], overlap: int, *, quadratic: bool)
     return np.concatenate([np.zeros((0, 2), np.int64), *pairs])
 
 
-def beyond(scores_of: ScoreRows, sequences: Sequence[Int[np.ndarray, " F"]], overlap: int) -> ScoreRows:
+def beyond(scores_of: ScoreRows, sequences: Sequence[Int[np.ndarray, " _"]], overlap: int) -> ScoreRows:
     """The scores without pairs of frames that are at most `overlap` apart in a sequence: they look alike anyway."""
     count = sum(map(len, sequences))
     place, number = np.zeros(count, np.int64), np.zeros(count, np.int64)
