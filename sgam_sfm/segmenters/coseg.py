@@ -106,8 +106,7 @@ class CoSeg:
     ) -> Iterator[tuple[ImageFile, Float32[np.ndarray, " C"] | SGAMError]]:
         """The mean of the patch features of every image, to tell which images are alike; they are cached as for labels.
 
-        It finds more of the overlapping pairs than the network's class token at the same block does (see
-        docs/pairs.md).
+        On the images of docs/pairs.md it found at least as many overlapping pairs as the network's class token there.
         """
         with self._cache() as cache:
             for image in images:
