@@ -28,11 +28,13 @@ from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED, MEANINGS, USAGE
 from sgam_sfm.files import disk_is_full
 from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.options import MatchOptions, SegmentOptions, starting_options
+from sgam_sfm.pair_lists.options import PairsOptions
 
 _COMMANDS = {
     MatchOptions: "match",
     CompareOptions: "compare",
     EvaluateOptions: "evaluate",
+    PairsOptions: "pairs",
     SegmentOptions: "segment",
     ShowOptions: "show",
     StatusOptions: "status",

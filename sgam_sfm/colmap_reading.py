@@ -187,6 +187,20 @@ def read_poses_and_points(folder: Path) -> tuple[dict[str, np.ndarray], Float[np
     return poses, np.array(points, np.float64).reshape(-1, 3)
 
 
+def read_observations(folder: Path) -> dict[str, Int[np.ndarray, " _"]]:
+    """The ids of the points that each image with a pose observes in a model, sorted, each once; images by name, sorted.
+
+    Raises: InputError when the folder holds no COLMAP model.
+    """
+    model = read_model(folder)
+    seen: dict[int, list[int]] = {image_id: [] for image_id in model.reg_image_ids()}
+    for point_id, point in model.points3D.items():
+        for image_id in {element.image_id for element in point.track.elements}:
+            seen[image_id].append(point_id)
+    images = sorted((model.image(image_id).name, image_id) for image_id in seen)
+    return {name: np.array(sorted(seen[image_id]), np.int64) for name, image_id in images}
+
+
 def database_content(path: Path) -> dict[str, dict]:
     """`read_database` with lists in place of arrays: two databases are equal when this is."""
     return _plain(read_database(path))

@@ -1,4 +1,4 @@
-"""Write keypoints and matches as hloc's HDF5 files, for the tools that read those.
+"""hloc's HDF5 files: write keypoints and matches for the tools that read those, read descriptors and pairs.
 
 hloc puts the origin at the centre of the first pixel, so its coordinates are ours minus 0.5. In the matches file it
 writes `/` in image names as `-` (hloc/utils/parsers.py, names_to_pair).
@@ -7,13 +7,15 @@ writes `/` in image names as `-` (hloc/utils/parsers.py, names_to_pair).
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
 import numpy as np
+from jaxtyping import Float32
 
-from sgam_core.errors import ShapeError
+from sgam_core.errors import InputError, ShapeError
 from sgam_sfm.files import replacing, require_space
 from sgam_sfm.pairs import Pair
 
@@ -77,6 +79,73 @@ def write_matches_h5(
             group = file.create_group("/".join(map(_flat, pair)))
             group["matches0"] = matches0
             group["matching_scores0"] = scores0
+
+
+def read_global_descriptors(path: Path, names: Sequence[str]) -> dict[str, Float32[np.ndarray, " D"]]:
+    """`/<name>/global_descriptor` of the images that have one.
+
+    Raises: InputError when the file cannot be read, has none of the images, or holds what is no descriptor.
+    """
+    found: dict[str, np.ndarray] = {}
+    with _opened(path) as file:
+        for name in names:
+            if isinstance(data := file.get(f"{name}/global_descriptor"), h5py.Dataset):
+                found[name] = np.asarray(data, np.float32).ravel()
+                size = len(next(iter(found.values())))
+                if len(found[name]) != size or not size or not np.isfinite(found[name]).all():
+                    raise InputError(
+                        f"descriptor of '{name}' in '{path}' has {len(found[name])} numbers; expected {size}, as the "
+                        "others, none of them NaN: extract it again"
+                    )
+        inside = next(iter(file), "")
+    if not found:
+        raise InputError(
+            f"'{path}' has a data set '<image name>/global_descriptor' for none of the {len(names)} images (it holds "
+            f"'{inside}', the images are like '{names[0]}'); names are relative to the image folder, and "
+            "`python -m hloc.extract_features --conf netvlad` makes such a file"
+        )
+    return found
+
+
+def read_match_counts_h5(path: Path, names: Sequence[str]) -> dict[Pair, int]:
+    """How many matches every pair of the given images has in a matches file.
+
+    Raises: InputError when the file cannot be read, names none of the pairs, or could mean two images by one name.
+    """
+    if alike := _alike(names):
+        raise InputError(
+            f"images '{alike[0]}' and '{alike[1]}' are both '{_flat(alike[0])}' in '{path}', since hloc writes '/' as "
+            "'-'; give hloc's pairs.txt instead"
+        )
+    original = {_flat(name): name for name in names}
+    counts: dict[Pair, int] = {}
+    inside = ""
+    with _opened(path) as file:
+        for flat0, partners in file.items():
+            for flat1, group in partners.items() if isinstance(partners, h5py.Group) else ():
+                inside = f"{flat0}/{flat1}"
+                matches = group.get("matches0") if isinstance(group, h5py.Group) else None
+                if isinstance(matches, h5py.Dataset) and flat0 in original and flat1 in original:
+                    counts[original[flat0], original[flat1]] = int(np.count_nonzero(np.asarray(matches) >= 0))
+    if not counts:
+        raise InputError(
+            f"'{path}' has matches ('<name>/<name>/matches0') of no pair of the {len(names)} images"
+            f"{f' (it holds {inside!r})' if inside else ''}; names are relative to the image folder"
+        )
+    return counts
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[h5py.File]:
+    """Raises: InputError when it is no HDF5 file, or damaged where it is read."""
+    if not path.is_file():
+        raise InputError(f"there is no file '{path}'; give an h5 file of hloc")
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError, ValueError, TypeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"'{path}' cannot be read as an h5 file of hloc ({reason}); copy or make it again") from error
 
 
 def _flat(name: str) -> str:

@@ -125,10 +125,10 @@ def _check_any(images: Mapping[str, ImageFile], failed: Mapping[str, str], folde
         raise InputError(f"none of the {len(failed)} images in '{folder}' can be used: {min(failed.values())}")
 
 
-def refuse_among_images(output: Path, folder: Path) -> None:
-    """Results among the images would be taken for images. Raises: OptionError."""
+def refuse_among_images(output: Path, folder: Path, flag: str = "--output") -> None:
+    """Results among the images would be taken for images. Raises: OptionError, which names the flag."""
     if output.resolve().is_relative_to(folder.resolve()):
-        raise OptionError(f"--output '{output}' lies in the image folder; choose one outside of it")
+        raise OptionError(f"{flag} '{output}' lies in the image folder; choose one outside of it")
 
 
 def same_content(images: Iterable[ImageFile]) -> tuple[str, ...]:

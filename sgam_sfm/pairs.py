@@ -39,9 +39,9 @@ class PairList:
 def read_pairs(path: Path, names: Sequence[str], unreadable: Collection[str] = ()) -> PairList:
     """Read a pair list: `nameA nameB` a line, as hloc and COLMAP write it.
 
-    Blank lines and lines that start with `#` are skipped. A tab separates names that contain spaces. `./a.jpg` and
-    `sub\\a.jpg` are understood where `a.jpg` and `sub/a.jpg` exist. The first spelling of a pair decides its direction
-    and place.
+    Blank lines and lines that start with `#` are skipped, as are the match indices beneath a pair in COLMAP's raw lists
+    (two numbers a line). A tab separates names that contain spaces. `./a.jpg` and `sub\\a.jpg` are understood where
+    `a.jpg` and `sub/a.jpg` exist. The first spelling of a pair decides its direction and place.
 
     Args: names: the images of the collection; unreadable: images that exist but cannot be read, whose pairs are set
         aside rather than refused.
@@ -53,6 +53,8 @@ def read_pairs(path: Path, names: Sequence[str], unreadable: Collection[str] = (
     set_aside: dict[Pair, None] = {}
     num_repeated = num_reversed = num_self = 0
     for number, line in _lines(path):
+        if (pairs or set_aside or num_self) and _is_match(line, known):
+            continue
         name0, name1 = pair = _pair(line, known, f"{path}, line {number}")
         target = set_aside if broken.intersection(pair) else pairs
         if name0 == name1:
@@ -101,7 +103,7 @@ def all_pairs(names: Sequence[str], max_images: int = 60) -> tuple[Pair, ...]:
         count = len(names) * (len(names) - 1) // 2
         raise InputError(
             f"{len(names)} images make {count} pairs; matching all of them is meant for at most {max_images} images: "
-            "name the pairs that overlap in a file and pass it with --pairs"
+            "choose those that overlap (`sgam-sfm pairs --help`), or name them in a file, and pass it with --pairs"
         )
     return tuple(combinations(names, 2))
 
@@ -141,7 +143,8 @@ def _lines(path: Path) -> list[tuple[int, str]]:
         raise InputError(f"the pair list {path} is UTF-16 text, as some Windows programs write it; save it as UTF-8")
     if b"\0" in data:
         raise InputError(
-            f"the pair list {path} is not a text file; expected UTF-8 text with lines of the form 'a.jpg b.jpg'"
+            f"the pair list {path} is not a text file; expected UTF-8 text with lines of the form 'a.jpg b.jpg' "
+            "(`sgam-sfm pairs from-file` makes one of a COLMAP database or hloc's matches.h5)"
         )
     try:
         text = data.decode("utf-8-sig")
@@ -149,6 +152,12 @@ def _lines(path: Path) -> list[tuple[int, str]]:
         raise InputError(f"the pair list {path} is not UTF-8 text; save it as UTF-8") from error
     lines = [(number, line.strip()) for number, line in enumerate(io.StringIO(text, newline=None), start=1)]
     return [(number, line) for number, line in lines if line and not line.startswith("#")]
+
+
+def _is_match(line: str, known: Collection[str]) -> bool:
+    """Whether a line holds the indices of two keypoints, and not two images that are called so."""
+    fields = line.split()
+    return len(fields) == 2 and all(field.isdecimal() and field not in known for field in fields)
 
 
 def _pair(line: str, known: Collection[str], where: str) -> Pair:

@@ -6,13 +6,13 @@ import hashlib
 import logging
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 import onnxruntime
-from jaxtyping import Float32, Int32
+from jaxtyping import Float16, Float32, Int32
 from scipy.ndimage import gaussian_filter
 
 from sgam_core.errors import OptionError, SGAMError
@@ -82,10 +82,8 @@ class CoSeg:
     def segment(
         self, images: Sequence[ImageFile], advance: Callable[[float], None]
     ) -> Iterator[tuple[ImageFile, Int32[np.ndarray, "H W"] | Exception]]:
-        with ExitStack() as stack:
-            # Two passes over the features, which need not fit into memory: without a cache they wait on the disk too.
-            cache = self._cache_folder or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="coseg-")))
-            cache.mkdir(parents=True, exist_ok=True)
+        # Two passes over the features, which need not fit into memory: without a cache they wait on the disk too.
+        with self._cache() as cache:
             errors: dict[str, SGAMError] = {}
             samples: list[np.ndarray] = []
             for image in sorted(images, key=lambda image: image.digest):
@@ -103,15 +101,43 @@ class CoSeg:
                     yield image, _label_map(project(self._features(image, cache)), centers, image)
                 advance(1 - _FEATURE_SHARE)
 
+    def describe(
+        self, images: Sequence[ImageFile], advance: Callable[[float], None]
+    ) -> Iterator[tuple[ImageFile, Float32[np.ndarray, " C"] | SGAMError]]:
+        """The mean of the patch features of every image, to tell which images are alike; they are cached as for labels.
+
+        On the images of docs/pairs.md it found at least as many overlapping pairs as the network's class token there.
+        """
+        with self._cache() as cache:
+            for image in images:
+                try:
+                    yield image, self._patches(image, cache).mean(axis=(0, 1), dtype=np.float32)
+                except SGAMError as error:
+                    yield image, error
+                advance(1)
+
+    @contextmanager
+    def _cache(self) -> Iterator[Path]:
+        """The folder of the features: the given one, or one that is removed at the end."""
+        with ExitStack() as stack:
+            cache = self._cache_folder or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="coseg-")))
+            cache.mkdir(parents=True, exist_ok=True)
+            yield cache
+
     def _features(self, image: ImageFile, cache: Path) -> Float32[np.ndarray, "rows columns C"]:
-        """Smoothed patch features, from the cache when it has them; in half precision in between, cached or not."""
+        """Smoothed patch features."""
+        patches = self._patches(image, cache).astype(np.float32)
+        return gaussian_filter(patches, (_SMOOTHING_SIGMA, _SMOOTHING_SIGMA, 0), mode="nearest")
+
+    def _patches(self, image: ImageFile, cache: Path) -> Float16[np.ndarray, "rows columns C"]:
+        """Patch features, from the cache when it has them."""
         path = cache / f"{image.digest}-{self._settings_key}.npy"
         features = _load(path)
         if features is None:
             features = self._patch_features(read_image(image))
             with replacing(path) as partial, partial.open("wb") as file:
                 np.save(file, features)
-        return gaussian_filter(features.astype(np.float32), (_SMOOTHING_SIGMA, _SMOOTHING_SIGMA, 0), mode="nearest")
+        return features
 
     def _draw(self, image: ImageFile, features: np.ndarray, num_samples: int) -> Float32[np.ndarray, "N C"]:
         patches = features.reshape(-1, features.shape[-1])

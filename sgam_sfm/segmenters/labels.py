@@ -42,16 +42,23 @@ class LabelFolder:
             advance(1.0)
             yield image, labels
 
-    def _labels(self, image: ImageFile) -> Int32[np.ndarray, "H W"]:
-        candidates = (f"{image.name}.png", PurePosixPath(image.name).with_suffix(".png").as_posix())
+    def read(self, name: str) -> Int32[np.ndarray, "H W"]:
+        """The label map of an image as it is in the folder.
+
+        Raises: InputError when there is none, there are two, or it is broken.
+        """
+        candidates = (f"{name}.png", PurePosixPath(name).with_suffix(".png").as_posix())
         found = [name for name in dict.fromkeys(candidates) if (self.folder / name).is_file()]
         if not found:
             raise InputError(
-                f"no labels for '{image.name}'; expected '{candidates[0]}' or '{candidates[1]}' in '{self.folder}'"
+                f"no labels for '{name}'; expected '{candidates[0]}' or '{candidates[1]}' in '{self.folder}'"
             )
         if len(found) > 1:
-            raise InputError(f"two label maps for '{image.name}': '{found[0]}' and '{found[1]}'; keep one of them")
-        labels = read_label_map(self.folder / found[0])
+            raise InputError(f"two label maps for '{name}': '{found[0]}' and '{found[1]}'; keep one of them")
+        return read_label_map(self.folder / found[0])
+
+    def _labels(self, image: ImageFile) -> Int32[np.ndarray, "H W"]:
+        labels = self.read(image.name)
         if labels.shape != (image.height, image.width) and not self.resize:
             raise InputError(
                 f"labels for '{image.name}' are {labels.shape[0]}x{labels.shape[1]} but the image is "

@@ -76,6 +76,21 @@ def test_a_cache_of_other_settings_is_not_used(quick, drawn, tmp_path, monkeypat
     assert len(list(tmp_path.iterdir())) == 2
 
 
+def test_the_descriptor_is_the_mean_of_the_features_that_labels_need_too(quick, drawn, tmp_path, monkeypatch):
+    images = inspect_all(drawn)
+    monkeypatch.setattr(quick, "_cache_folder", tmp_path)
+    run(quick, images)
+    monkeypatch.setattr(quick, "_patch_features", None)
+    gone = ImageFile(name="gone.png", path=drawn / "gone.png", width=8, height=8, digest="ff")
+    shares: list[float] = []
+    described = {file.name: made for file, made in quick.describe([*images[:2], gone], shares.append)}
+    features = np.load(next(tmp_path.glob(f"{images[1].digest}-*.npy"))).astype(np.float64)
+    np.testing.assert_allclose(described["1.png"], features.reshape(-1, 384).mean(axis=0), atol=1e-5)
+    assert not np.allclose(described["0.png"], described["1.png"], atol=1e-4)
+    assert isinstance(described["gone.png"], InputError)
+    assert shares == [1, 1, 1]
+
+
 def test_damaged_cache_is_computed_again(quick, drawn, tmp_path, monkeypatch, caplog):
     images = inspect_all(drawn)[:1]
     monkeypatch.setattr(quick, "_cache_folder", tmp_path)

@@ -6,8 +6,13 @@ import h5py
 import numpy as np
 import pytest
 
-from sgam_core.errors import ShapeError
-from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
+from sgam_core.errors import InputError, ShapeError
+from sgam_sfm.hloc_files import (
+    read_global_descriptors,
+    read_match_counts_h5,
+    write_keypoints_h5,
+    write_matches_h5,
+)
 
 
 def hloc_keypoints(path, name):
@@ -90,3 +95,63 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, indices, message):
 def test_keypoints_of_another_shape(tmp_path):
     with pytest.raises(ShapeError, match=r"keypoints of 'a' have shape \(4, 3\); expected \(N, 2\)"):
         write_keypoints_h5(tmp_path / "k.h5", {"a": np.zeros((4, 3))})
+
+
+def descriptors_file(path, vectors):
+    """As hloc.extract_features writes it: a group an image, nested where its name has a folder."""
+    with h5py.File(path, "w", libver="latest") as file:
+        for name, vector in vectors.items():
+            file.create_group(name).create_dataset("global_descriptor", data=np.asarray(vector, np.float16))
+    return path
+
+
+def test_global_descriptors_are_found_in_folders_too(tmp_path):
+    path = descriptors_file(tmp_path / "feats.h5", {"sub/deep/a.jpg": [1, 2], "b.jpg": [3, 4], "other.jpg": [5, 6]})
+    found = read_global_descriptors(path, ["b.jpg", "none.jpg", "sub", "sub/deep/a.jpg"])
+    assert {name: vector.tolist() for name, vector in found.items()} == {"b.jpg": [3, 4], "sub/deep/a.jpg": [1, 2]}
+
+
+@pytest.mark.parametrize(
+    ("vectors", "message"),
+    [
+        ({"a.jpg": [1, 2], "b.jpg": [1]}, "descriptor of 'b.jpg' in '{}' has 1 numbers; expected 2, as the others"),
+        (
+            {"a.jpg": [1, np.nan]},
+            "descriptor of 'a.jpg' in '{}' has 2 numbers; expected 2, as the others, none of them",
+        ),
+        (
+            {"images/a.jpg": [1]},
+            "'{}' has a data set '<image name>/global_descriptor' for none of the 2 images (it holds 'images', the "
+            "images are like 'a.jpg'); names are relative to the image folder",
+        ),
+    ],
+)
+def test_wrong_descriptors_are_named(tmp_path, vectors, message):
+    path = descriptors_file(tmp_path / "feats.h5", vectors)
+    with pytest.raises(InputError) as error:
+        read_global_descriptors(path, ["a.jpg", "b.jpg"])
+    assert str(error.value).startswith(message.format(path))
+
+
+@pytest.mark.parametrize("read", [read_global_descriptors, read_match_counts_h5])
+def test_a_file_that_is_no_h5_is_named(tmp_path, read):
+    path = tmp_path / "x.h5"
+    with pytest.raises(InputError, match=r"there is no file '.*x\.h5'; give an h5 file of hloc"):
+        read(path, ["a.jpg"])
+    path.write_bytes(b"\x89HDF\r\n\x1a\n and then nothing")
+    with pytest.raises(InputError, match=r"'.*x\.h5' cannot be read as an h5 file of hloc"):
+        read(path, ["a.jpg"])
+
+
+def test_pairs_of_a_matches_file_come_back_with_their_counts(tmp_path):
+    path, names = tmp_path / "matches.h5", ("a.jpg", "sub/b.jpg", "c.jpg")
+    matches = {(names[0], names[1]): np.array([[0, 0], [1, 2]]), (names[2], names[1]): np.zeros((0, 2), int)}
+    write_matches_h5(
+        path, matches, {pair: np.ones(len(rows)) for pair, rows in matches.items()}, dict.fromkeys(names, 3)
+    )
+    assert read_match_counts_h5(path, names) == {("a.jpg", "sub/b.jpg"): 2, ("c.jpg", "sub/b.jpg"): 0}
+    assert read_match_counts_h5(path, names[:2]) == {("a.jpg", "sub/b.jpg"): 2}
+    with pytest.raises(InputError, match=r"of no pair of the 1 images \(it holds 'c\.jpg/sub-b\.jpg'\)"):
+        read_match_counts_h5(path, ["sub/c.jpg"])
+    with pytest.raises(InputError, match=r"'sub-b\.jpg' and 'sub/b\.jpg' are both 'sub-b\.jpg' in"):
+        read_match_counts_h5(path, ["sub/b.jpg", "sub-b.jpg"])

@@ -36,6 +36,13 @@ def test_repeats_are_dropped_and_counted_and_the_first_spelling_wins(pair_file):
     )
 
 
+def test_match_indices_of_colmaps_raw_lists_are_skipped(pair_file):
+    path = pair_file("a.jpg b.jpg\n0 1\n2 7\n\nb.jpg sub/c.jpg\n12 3\n")
+    assert read_pairs(path, NAMES).pairs == (("a.jpg", "b.jpg"), ("b.jpg", "sub/c.jpg"))
+    with pytest.raises(InputError, match=r"line 1: '1' is not among the 4 images"):
+        read_pairs(pair_file("1 2\n1 3\n"), NAMES)
+
+
 def test_pairs_of_unreadable_images_are_set_aside(pair_file):
     path = pair_file("a.jpg bad.jpg\na.jpg b.jpg\nbad.jpg a.jpg\nbad.jpg bad.jpg\n")
     assert read_pairs(path, NAMES, unreadable={"bad.jpg"}) == PairList(
@@ -78,7 +85,8 @@ def test_list_without_pairs_is_refused(pair_file, content):
         ("été.jpg b.jpg".encode("latin-1"), "is not UTF-8 text; save it as UTF-8"),
         (
             b"SQLite format 3\0\x10\0",
-            "is not a text file; expected UTF-8 text with lines of the form 'a.jpg b.jpg'",
+            "is not a text file; expected UTF-8 text with lines of the form 'a.jpg b.jpg' (`sgam-sfm pairs from-file` "
+            "makes one of a COLMAP database or hloc's matches.h5)",
         ),
     ],
 )
