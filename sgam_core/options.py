@@ -240,6 +240,26 @@ class CollectionOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class GuidanceOptions(_Checked):
+    """Guided areas: a second, finer round where the first one shows both images to overlap (not in the paper)."""
+
+    enabled: bool = True
+    """Look again; otherwise the first round is the result, as in the paper."""
+    sure_matches: int = 150
+    """So many consistent whole-image matches need no areas to find more evidence (0: areas always)."""
+    sure_inlier_ratio: float = 0.5
+    """And so large a share of all of them is consistent."""
+    min_matches: int = 20
+    """Fewest consistent matches for a window."""
+    quantile: float = 0.02
+    """Share of the matches, weighted by score, left out at each side of a window (0: none; at most 0.45)."""
+    margin: float = 0.1
+    """Added on each side of a window, share of its long side (0: nothing)."""
+    min_gain: float = 1.1
+    """Crops are to be finer than the first round's matches by at least this factor."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class SGAMOptions(_Checked):
     """All stages of the algorithm."""
 
@@ -259,6 +279,8 @@ class SGAMOptions(_Checked):
     """GR."""
     collection: CollectionOptions = field(default_factory=CollectionOptions)
     """GMC."""
+    guidance: GuidanceOptions = field(default_factory=GuidanceOptions)
+    """Guided areas."""
 
 
 def changed(options: Any, **changes: Any) -> Any:
@@ -282,6 +304,7 @@ PAPER = changed(
     rejection__rule="paper",
     collection__rule="paper",
     collection__min_coverage=0.3,
+    guidance__enabled=False,
 )
 """The paper's own parameters (its appendix), with GR in the form that can accept an area."""
 
