@@ -166,10 +166,10 @@ def _guided(first: _Found, points: _Points, estimate: Estimate, options: SGAMOpt
         return None
     areas = (*first.areas, *verdict.areas)
     matches = _collected(areas, verdict.model, lambda: first.matches, points, options, begin=len(first.areas))
-    if verdict.model is None or (residuals(verdict.model.F, matches) <= options.geometry.max_residual).sum() < len(
-        agreeing
+    if verdict.model is None or (
+        (residuals(verdict.model.F, agreeing) <= options.geometry.max_residual).mean() < options.guidance.min_agreement
     ):
-        return None  # a finer look at the same ground finds more, unless it is the wrong ground
+        return None
     return _Found(matches=matches, model=verdict.model, areas=areas, notes=first.notes)
 
 

@@ -8,7 +8,7 @@ both images at the scale at which things have one size, up to the resolution of 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,13 +17,29 @@ from sgam_core.covisible import Frame, enclosing_box
 from sgam_core.options import CovisibleOptions, CropOptions, GuidanceOptions
 from sgam_core.types import Area, AreaMatch, Box, Matches
 
+_STRAY = 0.05  # a smaller share of a window's matches is no reason to look there
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Window:
-    """What some matches enclose in both images. scales: of its crops, matcher pixels per image pixel, at most 1."""
+    """What some matches enclose in both images.
+
+    scales: of its crops, matcher pixels per image pixel, at most 1. sigma: of the matches, image pixels per matcher
+    pixel.
+    """
 
     boxes: tuple[Box, Box]
     scales: tuple[float, float]
+    sigma: float
+
+    @property
+    def gain(self) -> float:
+        """How much finer the coarser of its crops is than the matches are."""
+        return self.sigma * min(self.scales)
+
+    def resized(self, factor: float) -> _Window:
+        """The same with crops so many times the size."""
+        return replace(self, scales=(self.scales[0] * factor, self.scales[1] * factor))
 
     @property
     def pixels(self) -> float:
@@ -52,21 +68,20 @@ def guided_areas(
         return ()
     rows = np.arange(len(matches))
     whole = _window(matches, rows, frame0, frame1, options)
-    factor = _within_budget([whole], crop)
-    windows = list(_split(matches, rows, frame0, frame1, crop.area_size / factor, options))
-    factor = min(_within_budget(windows, crop), *(crop.area_size / max(window.sides) for window in windows), 1.0)
-    gain = factor * float(np.median(matches.sigmas)) * min(1.0, *map(max, (window.scales for window in windows)))
-    if gain < options.min_gain:
-        return ()
+    largest = crop.area_size / _within_budget([whole], crop)
+    windows = _split(matches, rows, frame0, frame1, largest, options)
+    fitting = [window.resized(min(1.0, crop.area_size / max(window.sides))) for window in windows]
+    factor = _within_budget(fitting, crop)
+    finer = [window for window in (window.resized(factor) for window in fitting) if window.gain >= options.min_gain]
     return tuple(
         AreaMatch(
             area0=Area(kind="guided", box=window.boxes[0]),
             area1=Area(kind="guided", box=window.boxes[1]),
             distance=0.0,
-            scale0=factor * window.scales[0],
-            scale1=factor * window.scales[1],
+            scale0=window.scales[0],
+            scale1=window.scales[1],
         )
-        for window in windows
+        for window in finer
     )
 
 
@@ -93,8 +108,8 @@ def _split(
     points = (matches.points0, matches.points1)[longest // 2][rows, longest % 2]
     box = window.boxes[longest // 2]
     low = points < ((box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2)[longest % 2]
-    parts = [part for part in (rows[low], rows[~low]) if len(part) >= options.min_matches]
-    if not parts or len(parts[0]) == len(rows):
+    parts = [part for part in (rows[low], rows[~low]) if len(part) >= _STRAY * len(rows)]
+    if min(map(len, parts)) < options.min_matches or len(parts[0]) == len(rows):
         return [window]
     return [leaf for part in parts for leaf in _split(matches, part, frame0, frame1, largest, options)]
 
@@ -109,7 +124,7 @@ def _window(
         enclosing_box(chosen.points1, chosen.scores, frame1, enclosing),
     )
     ratio = _size_ratio(chosen.points0, chosen.points1)
-    return _Window(boxes=boxes, scales=(min(1.0, ratio), min(1.0, 1 / ratio)))
+    return _Window(boxes=boxes, scales=(min(1.0, ratio), min(1.0, 1 / ratio)), sigma=float(np.median(chosen.sigmas)))
 
 
 def _size_ratio(points0: Float[np.ndarray, "N 2"], points1: Float[np.ndarray, "N 2"]) -> float:

@@ -43,7 +43,7 @@ class CropOptions(_Checked):
     """Long side of an area's crop at the matcher, pixels. More is finer and slower."""
     image_size: int = 1024
     """Long side of a whole image at the matcher, pixels."""
-    max_crop_pixels: int = 8_000_000
+    max_crop_pixels: int = 4_000_000
     """Area-crop pixels matched per pair, both sides together; areas beyond it are skipped and counted (0: no limit)."""
     expand: float = 1.2
     """Side of the crop over the long side of its area."""
@@ -255,6 +255,8 @@ class GuidanceOptions(_Checked):
     """Share of the matches, weighted by score, left out at each side of a window (0: none; at most 0.45)."""
     margin: float = 0.1
     """Added on each side of a window, share of its long side (0: nothing)."""
+    min_agreement: float = 0.7
+    """Share of the first round's consistent matches that the second one's geometry must explain."""
     min_gain: float = 1.1
     """Crops are to be finer than the first round's matches by at least this factor."""
 
