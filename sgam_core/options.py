@@ -39,7 +39,7 @@ class _Checked:
 class CropOptions(_Checked):
     """How areas and whole images are given to the point matcher (paper, appendix, Area Size)."""
 
-    area_size: int = 640
+    area_size: int = 800
     """Long side of an area's crop at the matcher, pixels. More is finer and slower."""
     image_size: int = 1024
     """Long side of a whole image at the matcher, pixels."""
