@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -12,14 +12,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int32, UInt8
 
 from sgam_core.collection import collect, coverage, merge
-from sgam_core.crops import area_crop, whole_crop
-from sgam_core.geometry import estimate_two_view
+from sgam_core.covisible import Frame
+from sgam_core.crops import area_crop, box_crop, whole_crop
+from sgam_core.geometry import estimate_two_view, residuals
+from sgam_core.guidance import guided_areas
 from sgam_core.options import CropOptions, SGAMOptions
-from sgam_core.prediction import MatchedArea, predict
+from sgam_core.prediction import Estimate, MatchedArea, predict
 from sgam_core.protocols import AreaMatcher, PointMatcher
 from sgam_core.rejection import reject
 from sgam_core.semantic import SemanticAreaMatcher
-from sgam_core.types import AreaMatch, AreaState, Box, Crop, Image, Matches, PairResult, PutativeAreas
+from sgam_core.types import AreaMatch, AreaState, Box, Crop, Image, Matches, PairResult, PutativeAreas, TwoViewModel
 
 
 def match_pair(
@@ -73,7 +75,58 @@ def match_described(
     )
     clock = _Clock(points)
 
-    putative = area_matcher.match(description0, description1, points.whole)
+    guides = options.guidance.enabled and getattr(area_matcher, "guides", False)
+    first = _plain(points, estimate, options) if guides else None
+    clock.lap("whole images")
+    if first is None:
+        first = _by_areas(
+            lambda: area_matcher.match(description0, description1, points.whole), points, estimate, options, clock
+        )
+    found = _guided(first, points, estimate, options) or first if guides else first
+    clock.lap("guided areas")
+    kept = [area.area for area in found.areas if area.area.state is AreaState.KEPT]
+    return PairResult(
+        matches=found.matches,
+        areas=tuple(area.area for area in found.areas),
+        two_view=found.model,
+        coverage0=coverage([area.area0.box for area in kept], image0.width, image0.height),
+        coverage1=coverage([area.area1.box for area in kept], image1.width, image1.height),
+        whole_scale0=whole_crop(image0, options.crop).scale,
+        whole_scale1=whole_crop(image1, options.crop).scale,
+        fallback=found.fallback,
+        notes=found.notes + points.notes,
+        pixels_matched=points.pixels,
+        seconds=clock.seconds,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class _Found:
+    """What a round of matching found. areas: with their states; matches name them by their row."""
+
+    matches: Matches
+    model: TwoViewModel | None
+    areas: tuple[MatchedArea, ...] = ()
+    fallback: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def _plain(points: _Points, estimate: Estimate, options: SGAMOptions) -> _Found | None:
+    """The whole images, where they agree so well that areas have nothing to add but resolution."""
+    whole, guidance = points.whole(), options.guidance
+    model = estimate(whole)
+    if model is None or not guidance.sure_matches or model.num_inliers < guidance.sure_matches:
+        return None
+    if model.inlier_ratio < guidance.sure_inlier_ratio:
+        return None
+    return _Found(matches=whole, model=model, fallback="whole images agree, and crops would be no finer")
+
+
+def _by_areas(
+    propose: Callable[[], PutativeAreas], points: _Points, estimate: Estimate, options: SGAMOptions, clock: _Clock
+) -> _Found:
+    """The paper's algorithm: SAM, PM, GP, GR, GMC."""
+    putative = propose()
     clock.lap("area matching")
     confident, doubtful = points.inside(putative, options.prediction.max_candidates)
     if options.collection.min_coverage >= 1:
@@ -83,34 +136,60 @@ def match_described(
     clock.lap("GP")
     verdict = reject(areas, points.whole, points.whole_is_known, estimate, options.geometry, options.rejection)
     clock.lap("GR")
-    areas = [_final(area, verdict.fallback) for area in verdict.areas]
-    kept = {index: area for index, area in enumerate(areas) if area.area.state is AreaState.KEPT}
-    coverage0 = coverage([area.area.area0.box for area in kept.values()], image0.width, image0.height)
-    coverage1 = coverage([area.area.area1.box for area in kept.values()], image1.width, image1.height)
+    final = tuple(_final(area, verdict.fallback) for area in verdict.areas)
     if verdict.fallback:
-        matches = points.whole()
-        model = estimate(matches)
+        whole = points.whole()
+        found = _Found(
+            matches=whole, model=estimate(whole), areas=final, fallback=verdict.fallback, notes=putative.notes
+        )
     else:
-        inside = [
-            replace(area.matches, area_index=np.full(len(area.matches), index, np.int32))
-            for index, area in kept.items()
-        ]
-        collected = collect(inside, min(coverage0, coverage1), verdict.model, points.whole, options.collection)
-        matches, model = merge(inside, collected, options.collection), verdict.model
+        matches = _collected(final, verdict.model, points.whole, points, options)
+        found = _Found(matches=matches, model=verdict.model, areas=final, notes=putative.notes)
     clock.lap("GMC")
-    return PairResult(
-        matches=matches,
-        areas=tuple(area.area for area in areas),
-        two_view=model,
-        coverage0=coverage0,
-        coverage1=coverage1,
-        whole_scale0=whole_crop(image0, options.crop).scale,
-        whole_scale1=whole_crop(image1, options.crop).scale,
-        fallback=verdict.fallback,
-        notes=putative.notes + points.notes,
-        pixels_matched=points.pixels,
-        seconds=clock.seconds,
-    )
+    return found
+
+
+def _guided(first: _Found, points: _Points, estimate: Estimate, options: SGAMOptions) -> _Found | None:
+    """A second, finer round where the first one agrees; None where there is nothing to gain, or it fails."""
+    if first.model is None:
+        return None
+    agreeing = first.matches.select(residuals(first.model.F, first.matches) <= options.geometry.max_residual)
+    frame0, frame1 = map(Frame.of, points.images)
+    left = options.crop
+    if left.max_crop_pixels:
+        left = replace(left, max_crop_pixels=max(left.max_crop_pixels - points.pixels_of_areas, 1))
+    proposed = guided_areas(agreeing, frame0, frame1, left, options.guidance)
+    if not proposed:
+        return None
+    verdict = reject(points.guided(proposed), points.whole, True, estimate, options.geometry, options.rejection)
+    if verdict.fallback:
+        return None
+    areas = (*first.areas, *verdict.areas)
+    matches = _collected(areas, verdict.model, lambda: first.matches, points, options, begin=len(first.areas))
+    if verdict.model is None or (
+        (residuals(verdict.model.F, agreeing) <= options.geometry.max_residual).mean() < options.guidance.min_agreement
+    ):
+        return None
+    return _Found(matches=matches, model=verdict.model, areas=areas, notes=first.notes)
+
+
+def _collected(
+    areas: Sequence[MatchedArea],
+    model: TwoViewModel | None,
+    coarser: Callable[[], Matches],
+    points: _Points,
+    options: SGAMOptions,
+    begin: int = 0,
+) -> Matches:
+    """The matches of the kept areas from row `begin` on, and the coarser ones where these leave ground (GMC)."""
+    kept = [(row, area) for row, area in enumerate(areas) if row >= begin and area.area.state is AreaState.KEPT]
+    inside = [replace(area.matches, area_index=np.full(len(area.matches), row, np.int32)) for row, area in kept]
+    covered = [
+        coverage([getattr(area.area, side).box for _, area in kept], image.width, image.height)
+        for side, image in zip(("area0", "area1"), points.images, strict=True)
+    ]
+    collected = collect(inside, min(covered), model, coarser, options.collection)
+    return merge(inside, collected, options.collection)
 
 
 def match_whole(image0: Image, image1: Image, point_matcher: PointMatcher, options: CropOptions) -> Matches:
@@ -150,7 +229,7 @@ class _Points:
         area_crop: Callable[[Image, Box, CropOptions], Crop],
     ) -> None:
         self.images, self.matcher, self.options, self.area_crop = (image0, image1), matcher, options, area_crop
-        self.pixels = 0
+        self.pixels = self.pixels_of_areas = 0
         self.seconds = 0.0
         self.notes: tuple[str, ...] = ()
         self._whole: Matches | None = None
@@ -178,6 +257,15 @@ class _Points:
         confident = [next(areas) for _ in putative.confident]
         return confident, [[next(areas) for _ in group] for group in limited]
 
+    def guided(self, areas: Sequence[AreaMatch]) -> list[MatchedArea]:
+        """Point matches inside areas that say themselves how finely they are cropped."""
+        crops = [
+            (_scaled_crop(self.images[0], a.area0.box, a.scale0), _scaled_crop(self.images[1], a.area1.box, a.scale1))
+            for a in areas
+        ]
+        found = zip(areas, crops, self._match(crops), strict=True)
+        return [self._matched(area, pair, matches) for area, pair, matches in found]
+
     def _within_budget(self, planned: Sequence[AreaMatch], crops: Sequence[tuple[Crop, Crop]]) -> list[int]:
         """Rows to match: in order, until the pixel budget is spent."""
         budget = self.options.max_crop_pixels or float("inf")
@@ -189,6 +277,7 @@ class _Points:
             if spent + cost <= budget:
                 spent += cost
                 rows.append(k)
+        self.pixels_of_areas += spent
         waiting = sum(area.state is not AreaState.SKIPPED for area in planned) - len(rows)
         if waiting:
             self.notes += (f"{waiting} area matches beyond the pixel budget (max_crop_pixels)",)
@@ -224,6 +313,10 @@ class _Points:
             )
             for (crop0, crop1), found in zip(crops, matched, strict=True)
         ]
+
+
+def _scaled_crop(image: Image, box: Box, scale: float) -> Crop:
+    return box_crop(image, box, max(round(scale * max(box.width, box.height)), 1), upsample=False)
 
 
 def _limit_candidates(groups: Sequence[Sequence[AreaMatch]], max_candidates: int) -> list[list[AreaMatch]]:

@@ -39,11 +39,11 @@ class _Checked:
 class CropOptions(_Checked):
     """How areas and whole images are given to the point matcher (paper, appendix, Area Size)."""
 
-    area_size: int = 640
+    area_size: int = 800
     """Long side of an area's crop at the matcher, pixels. More is finer and slower."""
     image_size: int = 1024
     """Long side of a whole image at the matcher, pixels."""
-    max_crop_pixels: int = 8_000_000
+    max_crop_pixels: int = 4_000_000
     """Area-crop pixels matched per pair, both sides together; areas beyond it are skipped and counted (0: no limit)."""
     expand: float = 1.2
     """Side of the crop over the long side of its area."""
@@ -240,6 +240,28 @@ class CollectionOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class GuidanceOptions(_Checked):
+    """Guided areas: a second, finer round where the first one shows both images to overlap (not in the paper)."""
+
+    enabled: bool = True
+    """Look again; otherwise the first round is the result, as in the paper."""
+    sure_matches: int = 150
+    """So many consistent whole-image matches need no areas to find more evidence (0: areas always)."""
+    sure_inlier_ratio: float = 0.5
+    """And so large a share of all of them is consistent."""
+    min_matches: int = 20
+    """Fewest consistent matches for a window."""
+    quantile: float = 0.02
+    """Share of the matches, weighted by score, left out at each side of a window (0: none; at most 0.45)."""
+    margin: float = 0.1
+    """Added on each side of a window, share of its long side (0: nothing)."""
+    min_agreement: float = 0.7
+    """Share of the first round's consistent matches that the second one's geometry must explain."""
+    min_gain: float = 1.1
+    """Crops are to be finer than the first round's matches by at least this factor."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class SGAMOptions(_Checked):
     """All stages of the algorithm."""
 
@@ -259,6 +281,8 @@ class SGAMOptions(_Checked):
     """GR."""
     collection: CollectionOptions = field(default_factory=CollectionOptions)
     """GMC."""
+    guidance: GuidanceOptions = field(default_factory=GuidanceOptions)
+    """Guided areas."""
 
 
 def changed(options: Any, **changes: Any) -> Any:
@@ -282,6 +306,7 @@ PAPER = changed(
     rejection__rule="paper",
     collection__rule="paper",
     collection__min_coverage=0.3,
+    guidance__enabled=False,
 )
 """The paper's own parameters (its appendix), with GR in the form that can accept an area."""
 

@@ -45,6 +45,7 @@ class SemanticAreaMatcher:
     """The paper's area matcher, as an `AreaMatcher`."""
 
     needs_labels: ClassVar[bool] = True
+    guides: ClassVar[bool] = True
     options: SemanticOptions = field(default_factory=SemanticOptions)
 
     def describe(self, image: Image, labels: Int32[np.ndarray, "H W"] | None) -> SemanticDescription:

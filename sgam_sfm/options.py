@@ -23,6 +23,7 @@ from sgam_core.options import (
     CovisibleOptions,
     CropOptions,
     GeometryOptions,
+    GuidanceOptions,
     PredictionOptions,
     RejectionOptions,
     SemanticOptions,
@@ -120,6 +121,8 @@ class MatchOptions:
     """GR: wrong areas."""
     collection: CollectionOptions = field(default_factory=CollectionOptions)
     """GMC: matches of the whole images."""
+    guidance: GuidanceOptions = field(default_factory=GuidanceOptions)
+    """Guided areas: a second, finer round."""
     keypoints: KeypointOptions = field(default_factory=KeypointOptions)
     """Merging the points of all pairs into keypoints."""
 

@@ -36,19 +36,21 @@ from sgam_sfm.summary import versions
 VERSION = 1
 _AMP_OVERLAP = 0.7
 
-_OFF = {"prediction__enabled": False, "rejection__rule": "none", "collection__rule": "none"}
+_PAPER = {"guidance__enabled": False}
+_OFF = {**_PAPER, "prediction__enabled": False, "rejection__rule": "none", "collection__rule": "none"}
 _ABLATION: Mapping[str, Mapping[str, Any]] = {
     "SOA": {**_OFF, "semantic__intersections__enabled": False},
     "SIA": {**_OFF, "semantic__objects__enabled": False},
     "SOA+SIA": _OFF,
-    "+GP": {"rejection__rule": "none", "collection__rule": "none"},
-    "+GR": {"prediction__enabled": False, "collection__rule": "none"},
-    "+GP+GR": {"collection__rule": "none"},
-    "full": {},
-    "full, GR paper": {"rejection__rule": "paper", "collection__rule": "paper"},
-    "full, GR paper-literal": {"rejection__rule": "paper-literal", "collection__rule": "paper-literal"},
+    "+GP": {**_PAPER, "rejection__rule": "none", "collection__rule": "none"},
+    "+GR": {**_PAPER, "prediction__enabled": False, "collection__rule": "none"},
+    "+GP+GR": {**_PAPER, "collection__rule": "none"},
+    "full": _PAPER,
+    "full, GR paper": {**_PAPER, "rejection__rule": "paper", "collection__rule": "paper"},
+    "full, GR paper-literal": {**_PAPER, "rejection__rule": "paper-literal", "collection__rule": "paper-literal"},
+    "full, guided": {},
 }
-"""The paper's table of components, and its own rules of GR and GMC."""
+"""The paper's table of components, its own rules of GR and GMC, and the second round of guided areas on top."""
 
 _SLICES: Mapping[str, tuple[Callable[[TruePair], float | str | None], Sequence[tuple[float, float] | str]]] = {
     "rotation, degrees": (lambda pair: pair.angle_deg, ((0, 15), (15, 30), (30, 45), (45, inf))),

@@ -1,0 +1,121 @@
+"""Guided areas: where they lie, how finely they are cropped, and when there are none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sgam_core import SemanticAreaMatcher, SGAMOptions
+from sgam_core.a2pm import match_described, match_whole
+from sgam_core.covisible import Frame
+from sgam_core.guidance import guided_areas
+from sgam_core.options import CropOptions, GuidanceOptions, changed
+from sgam_core.types import AreaState, Matches
+from tests.room import Room, TrueMatcher
+
+FRAME = Frame(name="a", width=3000, height=2000, camera_matrix=None)
+CROP = CropOptions(area_size=640, max_crop_pixels=4_000_000)
+
+
+def zoomed(factor: float, shift: float = 0.0, *, sigma: float = 3.0, count: int = 900) -> Matches:
+    """Matches all over what two images share, the second `factor` times as large about the middle, and shifted."""
+    points0 = np.random.default_rng(0).uniform(0, (FRAME.width, FRAME.height), (count, 2))
+    middle = np.array([FRAME.width / 2, FRAME.height / 2])
+    points1 = (points0 - middle) * factor + middle + (shift, 0)
+    inside = ((points1 >= 0) & (points1 < (FRAME.width, FRAME.height))).all(axis=1)
+    points0, points1 = points0[inside], points1[inside]
+    sigmas = np.full(len(points0), sigma)
+    return Matches(points0=points0, points1=points1, scores=np.ones(len(points0)), sigmas0=sigmas, sigmas1=sigmas)
+
+
+def crop_sides(areas) -> np.ndarray:
+    """Width and height of every crop, (A, 2 images, 2)."""
+    return np.array(
+        [
+            [(area.box.width * scale, area.box.height * scale) for area, scale in sides]
+            for sides in (((a.area0, a.scale0), (a.area1, a.scale1)) for a in areas)
+        ]
+    )
+
+
+@settings(deadline=None)
+@given(factor=st.floats(0.5, 2.0), shift=st.floats(-1500, 1500), size=st.integers(600, 2000))
+def test_windows_cover_the_overlap_within_the_limits(factor, shift, size):
+    matches, crop = zoomed(factor, shift, count=3000), replace(CROP, area_size=size)
+    areas = guided_areas(matches, FRAME, FRAME, crop, GuidanceOptions())
+    if not areas:
+        return
+    sides = crop_sides(areas)
+    assert sides.max() <= size + 1e-6
+    assert sides.prod(axis=2).sum() <= 4_000_000 * (1 + 1e-9)
+    covered = [a.area0.box.contains(matches.points0) & a.area1.box.contains(matches.points1) for a in areas]
+    assert np.any(covered, axis=0).mean() > 0.75  # the outermost matches are left out
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_things_have_one_size_in_both_crops_and_neither_is_enlarged(factor):
+    areas = guided_areas(zoomed(factor), FRAME, FRAME, CROP, GuidanceOptions())
+    assert len(areas) > 1
+    for area in areas:
+        assert area.scale0 / area.scale1 == pytest.approx(factor, rel=1e-6)
+        assert max(area.scale0, area.scale1) <= 1
+
+
+def test_more_pixels_are_spent_up_to_the_resolution_of_the_images():
+    few, many = (
+        guided_areas(zoomed(1), FRAME, FRAME, replace(CROP, max_crop_pixels=pixels), GuidanceOptions())
+        for pixels in (2_000_000, 0)
+    )
+    assert len(few) < len(many)
+    assert max(area.scale0 for area in few) < 0.6
+    assert max(area.scale0 for area in many) == 1
+
+
+@pytest.mark.parametrize("matches", [zoomed(1, count=19), zoomed(1, sigma=1.0), Matches.empty()])
+def test_no_window_with_few_matches_or_without_a_gain_in_resolution(matches):
+    assert guided_areas(matches, FRAME, FRAME, CROP, GuidanceOptions()) == ()
+
+
+def in_room(room: Room, options: SGAMOptions, names=("view03.jpg", "view04.jpg")):
+    matcher = SemanticAreaMatcher(options=options.semantic)
+    images = [room.images[name] for name in names]
+    described = [matcher.describe(room.images[name], room.renderings[name].labels.astype(np.int32)) for name in names]
+    return match_described(*images, *described, matcher, TrueMatcher(room), options)
+
+
+COARSE = changed(SGAMOptions(), crop__image_size=256, crop__area_size=320)
+
+
+def test_images_that_agree_are_looked_at_again_more_finely(room):
+    found = in_room(room, COARSE)
+    kept = [area for area in found.areas if area.state is AreaState.KEPT]
+    assert kept
+    assert {area.area0.kind for area in found.areas} == {"guided"}
+    assert all(area.scale0 > 1.1 * found.whole_scale0 for area in kept)
+    fine = found.matches.area_index >= 0
+    assert fine.mean() > 0.5
+    assert found.fallback == ""
+
+
+def test_images_without_more_resolution_cost_what_they_cost_plainly(room):
+    options = changed(SGAMOptions(), crop__image_size=640)
+    found = in_room(room, options)
+    images = [room.images[name] for name in ("view03.jpg", "view04.jpg")]
+    plain = match_whole(*images, TrueMatcher(room), options.crop)
+    assert found.fallback == "whole images agree, and crops would be no finer"
+    assert found.areas == ()
+    np.testing.assert_array_equal(found.matches.points0, plain.points0)
+    assert found.pixels_matched == 2 * 640 * 480
+
+
+def test_areas_find_the_evidence_where_whole_images_do_not_agree(room):
+    options = changed(COARSE, guidance__sure_matches=10**6, crop__area_size=160)
+    found = in_room(room, options)
+    assert {area.area0.kind for area in found.areas} > {"guided"}
+    first = in_room(room, changed(options, guidance__enabled=False))
+    assert not any(area.area0.kind == "guided" for area in first.areas)
+    assert np.median(found.matches.sigmas) < np.median(first.matches.sigmas)
