@@ -144,6 +144,7 @@ def figures_of(pairs: Sequence[JudgedPair], auc_degrees: Sequence[float]) -> dic
         ("soa", areas_of(pairs, kind="object", stage="putative")),
         ("sia", areas_of(pairs, kind="intersection", stage="putative")),
         ("gp", areas_of(pairs, stage="predicted")),
+        ("guided", areas_of(pairs, kind="guided")),
         ("all", areas_of(pairs)),
         ("after_gr", areas_of(pairs, kept=True)),
     ):
