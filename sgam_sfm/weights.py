@@ -142,6 +142,35 @@ ADE20K = WeightsSpec(
     command="sgam-sfm models get ade20k",
 )
 
+# No package carries these three, and their publishers state neither size nor checksum: the matchers check names and
+# shapes of all parameters instead. They are kept where torch-hub keeps them for others who use them.
+_LIGHTGLUE_RELEASE = "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv"
+_MAGIC_LEAP = "Magic Leap's: research only, no commercial use"
+
+SIFT_LIGHTGLUE = WeightsSpec(
+    name="LightGlue (SIFT)",
+    cache_name="sift_lightglue_v0-1_arxiv.pth",
+    url=f"{_LIGHTGLUE_RELEASE}/sift_lightglue.pth",
+    license="Apache-2.0",
+    command="sgam-sfm models get sift-lightglue",
+)
+
+SUPERPOINT = WeightsSpec(
+    name="SuperPoint",
+    cache_name="superpoint_v1.pth",
+    url=f"{_LIGHTGLUE_RELEASE}/superpoint_v1.pth",
+    license=_MAGIC_LEAP,
+    command="sgam-sfm models get superpoint-lightglue --accept-licence superpoint-lightglue",
+)
+
+SUPERPOINT_LIGHTGLUE = WeightsSpec(
+    name="LightGlue (SuperPoint)",
+    cache_name="superpoint_lightglue_v0-1_arxiv.pth",
+    url=f"{_LIGHTGLUE_RELEASE}/superpoint_lightglue.pth",
+    license="Apache-2.0",
+    command="sgam-sfm models get superpoint-lightglue --accept-licence superpoint-lightglue",
+)
+
 # Kornia publishes neither size nor checksum: the matcher checks names and shapes of all parameters instead.
 LOFTR_OUTDOOR = WeightsSpec(
     name="LoFTR (outdoor)",

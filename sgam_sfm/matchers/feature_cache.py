@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 from sgam_core.types import Crop
 
 
+@runtime_checkable
 class Sized(Protocol):
     """Something that knows how much memory it takes."""
 

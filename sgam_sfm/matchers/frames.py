@@ -26,6 +26,6 @@ def rgb_frames(crops: Sequence[Crop], multiple: int, device: torch.device) -> Fl
 
 
 def ready(net: Net, device: torch.device) -> Net:
-    """A network of convolutions, ready to run; with channels last it takes half to two thirds of the time on the CPU."""
+    """A network of convolutions, ready to run; with channels last it takes about half the time on the CPU."""
     net.eval().requires_grad_(False).to(device)
     return nn.Module.to(net, memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -37,7 +37,7 @@ class LightGlueAssignment:
     ) -> None:
         if batch_size > 1:
             config |= {"depth_confidence": -1, "width_confidence": -1}
-        net = Network(None, filter_threshold=min_score, **config)  # without a name it downloads nothing
+        net = Network(None, filter_threshold=min_score, **config)  # type: ignore[arg-type]  # without a name it downloads nothing
         fill(net, _state(path, net), path, "LightGlue")
         self._net = net.eval().requires_grad_(False).to(device)
         self._batch_size = batch_size
@@ -58,7 +58,10 @@ class LightGlueAssignment:
 
     def _assign(self, pairs: Sequence[tuple[Features, Features]]) -> list[Assignment]:
         found = self._net({f"image{i}": self._inputs([pair[i] for pair in pairs]) for i in (0, 1)})
-        return [Assignment(*rows.T, scores) for rows, scores in zip(found["matches"], found["scores"], strict=True)]
+        return [
+            Assignment(rows[:, 0], rows[:, 1], scores)
+            for rows, scores in zip(found["matches"], found["scores"], strict=True)
+        ]
 
     def _inputs(self, sides: Sequence[Features]) -> dict[str, Tensor]:
         inputs = {

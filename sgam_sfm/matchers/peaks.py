@@ -9,19 +9,20 @@ from torch import Tensor
 
 from sgam_core.types import Crop
 
-RADIUS = 2  # pixels around a maximum that are not higher, and that a crop's border is away
 
-
-def peaks(scores: Float[Tensor, "h w"], crop: Crop, count: int, *, minimum: float) -> Int[Tensor, "K 2"]:
+def peaks(
+    scores: Float[Tensor, "h w"], crop: Crop, count: int, *, minimum: float, radius: int = 2
+) -> Int[Tensor, "K 2"]:
     """The pixels (x, y) of the `count` highest maxima, highest first, within the crop and its mask.
 
-    Args: scores: of the crop, padded to the right and the bottom at most. minimum: maxima exceed it.
+    Args: scores: of the crop, padded to the right and the bottom at most. minimum: maxima exceed it. radius: pixels
+        around a maximum that are lower, and that it is away from the crop's border.
     """
     width, height = crop.size
-    side = 2 * RADIUS + 1
+    side = 2 * radius + 1
     found = nms2d(scores[None, None], (side, side), mask_only=True)[0, 0] & (scores > minimum)
     inner = torch.zeros_like(found)
-    inner[RADIUS : max(height - RADIUS, 0), RADIUS : max(width - RADIUS, 0)] = True
+    inner[radius : max(height - radius, 0), radius : max(width - radius, 0)] = True
     if (mask := crop.mask()) is not None:
         inner[:height, :width] &= torch.from_numpy(mask).to(inner.device)
     rows, columns = torch.nonzero(found & inner, as_tuple=True)

@@ -26,7 +26,7 @@ class SIFTExtractor:
 
     def __init__(self, max_features: int, device: torch.device) -> None:
         # With its precise upscaling, OpenCV has the first pixel centred on 0 in every octave.
-        self._sift = cv2.SIFT_create(
+        self._sift = cv2.SIFT.create(
             nfeatures=checked_count(max_features), contrastThreshold=CONTRAST, enable_precise_upscale=True
         )
         self._device = device
