@@ -25,9 +25,11 @@ class SIFTExtractor:
     """SIFT features of crops, by OpenCV, the strongest `max_features`."""
 
     def __init__(self, max_features: int, device: torch.device) -> None:
+        self._count = checked_count(max_features)
         # With its precise upscaling, OpenCV has the first pixel centred on 0 in every octave.
-        self._sift = cv2.SIFT.create(
-            nfeatures=checked_count(max_features), contrastThreshold=CONTRAST, enable_precise_upscale=True
+        self._strongest, self._all = (
+            cv2.SIFT.create(nfeatures=count, contrastThreshold=CONTRAST, enable_precise_upscale=True)
+            for count in (max_features, 0)
         )
         self._device = device
 
@@ -35,9 +37,14 @@ class SIFTExtractor:
         return [self._extract(crop) for crop in crops]
 
     def _extract(self, crop: Crop) -> Features:
-        mask = crop.mask()
         gray = cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY)
-        found, descriptors = self._sift.detectAndCompute(gray, None if mask is None else mask.astype(np.uint8))
+        mask = crop.mask()
+        if mask is None:
+            found, descriptors = self._strongest.detectAndCompute(gray, None)
+        else:  # OpenCV would count those under the mask, too
+            found, descriptors = self._all.detectAndCompute(gray, mask.astype(np.uint8))
+            best = np.argsort([-keypoint.response for keypoint in found], kind="stable")[: self._count]
+            found, descriptors = [found[row] for row in best], descriptors[best] if len(best) else descriptors
         if not found:
             return Features.none(crop, CHANNELS, self._device)
         points = np.array([keypoint.pt for keypoint in found], np.float32) + np.float32(0.5)
