@@ -17,6 +17,7 @@ from sgam_sfm.matchers.lightglue import LightGlueAssignment
 from sgam_sfm.matchers.peaks import parabola, peaks
 from sgam_sfm.matchers.sparse import Features, SparseMatcher, batch_size, checked_count
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
+from sgam_sfm.matchers.subpixel import aligned
 from sgam_sfm.weights import ALIKED, ALIKED_LIGHTGLUE, find_all_weights
 
 MODEL = "aliked-n16"
@@ -59,13 +60,15 @@ def aliked_lightglue(
     seed: int = 0,
     max_features: int = 2048,
     min_score: float = 0.1,
+    photometric: bool = True,
     batch: int = 0,
 ) -> SparseMatcher:
     """ALIKED (n16) with LightGlue.
 
     Args: weights: a folder with both files under their own names; found by itself when omitted. device: a torch device.
         seed: accepted as by every matcher, but nothing here is random. max_features: of a crop, by score. min_score:
-        matches exceed it. batch: crops, or pairs, that go through a network together; 0: 1 on the CPU, 8 elsewhere.
+        matches exceed it. photometric: align the patches of the matches in the end, on the CPU. batch: crops, or pairs,
+        that go through a network together; 0: 1 on the CPU, 8 elsewhere.
     Raises: WeightsError when there are no weights or they are not those of the models; OptionError for wrong options.
     """
     place, files = find_device(device), find_all_weights((ALIKED, ALIKED_LIGHTGLUE), weights)
@@ -73,5 +76,6 @@ def aliked_lightglue(
     return SparseMatcher(
         ALIKEDExtractor(files[0], max_features, place),
         LightGlueAssignment(files[1], place, batch_size=together, min_score=min_score, input_dim=CHANNELS),
+        refine=aligned if photometric else None,
         batch_size=together,
     )

@@ -1,6 +1,8 @@
 """DISK with LightGlue, on kornia's models (Tyszkiewicz et al., NeurIPS 2020; Lindenberger et al., ICCV 2023).
 
-DISK's keypoints are whole pixels; here a parabola through its scores places them below the pixel.
+DISK's keypoints are whole pixels; here a parabola through its scores places them below the pixel. They lie a quarter of
+a pixel to the right of what they mark and half of one below it, at any scale, so that a change of scale between the
+images would show: where the patches of a match look alike, they decide.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from sgam_sfm.matchers.lightglue import LightGlueAssignment
 from sgam_sfm.matchers.peaks import parabola, peaks
 from sgam_sfm.matchers.sparse import Features, SparseMatcher, batch_size, checked_count
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
+from sgam_sfm.matchers.subpixel import aligned
 from sgam_sfm.weights import DISK, DISK_LIGHTGLUE, find_all_weights
 
 CHANNELS = 128
@@ -60,6 +63,7 @@ def disk_lightglue(
     seed: int = 0,
     max_features: int = 2048,
     min_score: float = 0.1,
+    photometric: bool = True,
     batch: int = 0,
 ) -> SparseMatcher:
     """DISK (depth) with LightGlue.
@@ -71,5 +75,6 @@ def disk_lightglue(
     return SparseMatcher(
         DISKExtractor(files[0], max_features, place),
         LightGlueAssignment(files[1], place, batch_size=together, min_score=min_score, input_dim=CHANNELS),
+        refine=aligned if photometric else None,
         batch_size=together,
     )

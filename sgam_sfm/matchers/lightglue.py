@@ -22,8 +22,8 @@ class LightGlueAssignment:
     """Assigns features by LightGlue with the weights of a file.
 
     Pairs with equal numbers of features go through the network together, up to `batch_size`. Then neither the number of
-    layers nor that of the points adapts to a pair: it would depend on the others. One by one it does, which saves half
-    of the time. The score of a match is the network's.
+    layers nor that of the points adapts to a pair: it would depend on the others. One by one it does, which saves time.
+    The score of a match is the network's.
 
     Args:
         path: the weights. device: where to run.

@@ -101,7 +101,7 @@ def superpoint_lightglue(
 ) -> SparseMatcher:
     """SuperPoint with LightGlue.
 
-    Args and errors: as `xfeat_lighterglue`.
+    Args and errors: as `aliked_lightglue`.
     """
     place, files = find_device(device), find_all_weights((SUPERPOINT, SUPERPOINT_LIGHTGLUE), weights)
     together = batch_size(place, batch)

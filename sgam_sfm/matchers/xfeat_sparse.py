@@ -79,8 +79,7 @@ def xfeat_lighterglue(
 ) -> SparseMatcher:
     """XFeat's sparse keypoints with LighterGlue, a small LightGlue.
 
-    Args: photometric: align the patches of the matches in the end, on the CPU. Others, and errors: as
-        `aliked_lightglue`.
+    Args and errors: as `aliked_lightglue`.
     """
     place, files = find_device(device), find_all_weights((XFEAT, LIGHTERGLUE), weights)
     together = batch_size(place, batch)
