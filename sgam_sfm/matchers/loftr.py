@@ -23,6 +23,7 @@ from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Crop, Matches
 from sgam_sfm.machine import find_device
 from sgam_sfm.matchers.masks import wanted
+from sgam_sfm.matchers.state_dicts import fill
 from sgam_sfm.weights import LOFTR_INDOOR, LOFTR_OUTDOOR, find_weights
 
 CELL = 8
@@ -184,19 +185,6 @@ def _load(path: Path, net: nn.Module) -> nn.Module:
     if not isinstance(found, dict):
         raise WeightsError(f"'{path}' holds no state dict of LoFTR but a {type(content).__name__}")
     state = {str(key).removeprefix("matcher."): value for key, value in found.items()}
-    expected = net.state_dict()
-    wrong = {
-        "missing": [key for key in expected if key not in state],
-        "unexpected": [key for key in state if key not in expected],
-        "of another shape": [key for key in expected if key in state and not _alike(state[key], expected[key])],
-    }
-    if any(wrong.values()):
-        listed = [f"{len(keys)} {what} ({', '.join(keys[:3])})" for what, keys in wrong.items() if keys]
-        raise WeightsError(f"'{path}' does not hold the weights of LoFTR: {'; '.join(listed)}")
-    net.load_state_dict(state, strict=True)
+    fill(net, state, path, "LoFTR")
     # With channels last the whole takes three quarters of the time on the CPU.
     return nn.Module.to(net.eval().requires_grad_(False), memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-
-def _alike(value: object, expected: Tensor) -> bool:
-    return isinstance(value, Tensor) and value.shape == expected.shape

@@ -6,10 +6,15 @@ Rough matches already tell how the surroundings map, so each patch is compared t
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.spatial import cKDTree
+
+from sgam_core.types import Crop, Matches
+from sgam_sfm.matchers.masks import wanted
 
 RADIUS = 7  # samples from the centre of a patch to its side
 SIDE = 2 * RADIUS + 1
@@ -18,6 +23,8 @@ MIN_CONTRAST = 1.0  # standard deviation of a patch in gray levels, below which 
 MIN_NEIGHBOURS = 4  # for an affine map, which has three unknowns a row
 OUTLYING = 0.1  # this far off the local map (in radii of the neighbourhood) a neighbour loses half its say
 PRIOR = 1e-3  # towards the identity, for neighbours on a line
+MIN_CORRELATION = 0.6  # of two patches that may move a match
+MAX_SHIFT = 2.0  # crop pixels; a larger one has slid along an edge
 
 _span = np.arange(-RADIUS, RADIUS + 1, dtype=np.float32)
 _GRID = np.stack(np.meshgrid(_span, _span), -1).reshape(-1, 2)
@@ -90,6 +97,23 @@ def refine(
     textured = np.minimum(contrast0, contrast1) > MIN_CONTRAST
     correlation[textured] = ((template * patches) @ _WINDOW)[textured]
     return points1, correlation.clip(-1, 1)
+
+
+def aligned(crop0: Crop, crop1: Crop, matches: Matches) -> Matches:
+    """The matches with their second points moved to where the patches agree; where they do not, as they were.
+
+    The scores fall by the share of the patches that does not correlate.
+    """
+    gray0, gray1 = (cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY).astype(np.float32) for crop in (crop0, crop1))
+    affines = local_affines(matches.points0, matches.points1)
+    points1, correlations = refine(gray0, gray1, matches.points0, matches.points1, affines, strides=(1,))
+    near = np.linalg.norm(points1 - matches.points1, axis=1) < MAX_SHIFT
+    better = near & (correlations > MIN_CORRELATION) & wanted(crop1, points1)
+    return replace(
+        matches,
+        points1=np.where(better[:, None], points1, matches.points1),
+        scores=matches.scores * (1 + correlations) / 2,
+    )
 
 
 def _smoothed(gray: np.ndarray, stride: int) -> np.ndarray:

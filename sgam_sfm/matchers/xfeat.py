@@ -13,12 +13,10 @@ Follows the paper's semi-dense mode with five differences, each measured:
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -27,11 +25,13 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, normalize
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from sgam_core.errors import OptionError, WeightsError
+from sgam_core.errors import OptionError
 from sgam_core.types import Crop, Matches
 from sgam_sfm.machine import find_device
+from sgam_sfm.matchers.feature_cache import FeatureCache
 from sgam_sfm.matchers.masks import wanted
-from sgam_sfm.matchers.subpixel import local_affines, refine
+from sgam_sfm.matchers.state_dicts import fill, read_tensors
+from sgam_sfm.matchers.subpixel import aligned
 from sgam_sfm.weights import XFEAT, find_weights
 
 CELL = 8  # pixels of the network's input per cell
@@ -39,8 +39,6 @@ MULTIPLE = 32  # the input's width and height are multiples of this
 SOFTMAX_TEMPERATURE = 3.0  # of the 8 x 8 offset logits, as published
 OFFSET_GAIN = 1.2  # true offset over expected offset: regressed on warps with exact ground truth
 MIN_FEATURES = 64  # of a crop, however small
-MIN_CORRELATION = 0.6  # of two patches that may move a match
-MAX_SHIFT = 2.0  # crop pixels; a larger one has slid along an edge
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,6 +85,7 @@ class XFeatStar:
 
     Attributes:
         pixels_extracted: crop pixels that went through the network so far, for cost reports.
+        features: what is kept of the crops.
     """
 
     def __init__(
@@ -116,24 +115,27 @@ class XFeatStar:
         self.min_confidence = min_confidence
         self.min_cosine = min_cosine
         self.photometric = photometric
-        self.batch_size = batch_size or (1 if self.device.type == "cpu" else 8)
-        self.cache_bytes = cache_bytes
-        self.pixels_extracted = 0
-        self._cache: OrderedDict[tuple, _Features] = OrderedDict()
-        self._net = _load(find_weights(XFEAT, weights)).to(self.device)
+        self.features: FeatureCache[_Features] = FeatureCache(
+            self._extract, batch_size=batch_size or (1 if self.device.type == "cpu" else 8), max_bytes=cache_bytes
+        )
+        self._net = load_xfeat(find_weights(XFEAT, weights), sparse=False).to(self.device)
+
+    @property
+    def pixels_extracted(self) -> int:
+        return self.features.pixels_extracted
 
     def reset(self) -> None:
         """Forget all features."""
-        self._cache.clear()
+        self.features.clear()
 
     @torch.inference_mode()
     def match(self, pairs: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
         """Match every pair of crops; see `PointMatcher.match`."""
-        self._extract_all([crop for pair in pairs for crop in pair])
+        self.features.fetch([crop for pair in pairs for crop in pair])
         return [self._match(crop0, crop1) for crop0, crop1 in pairs]
 
     def _match(self, crop0: Crop, crop1: Crop) -> Matches:
-        features0, features1 = self._features(crop0), self._features(crop1)
+        features0, features1 = self.features.of(crop0), self.features.of(crop1)
         rows0, rows1, cosines = _mutual_nearest(features0.descriptors, features1.descriptors, self.min_cosine)
         side0, side1 = features0.select(rows0), features1.select(rows1)
 
@@ -147,36 +149,11 @@ class XFeatStar:
 
         good = (confidences1 > self.min_confidence).cpu().numpy() & wanted(crop0, points0) & wanted(crop1, points1)
         matches = Matches(points0=points0[good], points1=points1[good], scores=scores[good])
-        return _aligned(crop0, crop1, matches) if self.photometric else matches
-
-    def _features(self, crop: Crop) -> _Features:
-        if crop.key not in self._cache:  # dropped since, or larger than the cache
-            self._keep(crop, self._extract([crop])[0])
-        self._cache.move_to_end(crop.key)
-        return self._cache[crop.key]
-
-    def _keep(self, crop: Crop, features: _Features) -> None:
-        self._cache[crop.key] = features
-        while sum(f.nbytes for f in self._cache.values()) > self.cache_bytes and len(self._cache) > 1:
-            self._cache.popitem(last=False)
-
-    def _extract_all(self, crops: Sequence[Crop]) -> None:
-        """Extract the crops that are not kept yet, in batches of equal size."""
-        by_size: dict[tuple[int, int], dict[tuple, Crop]] = {}
-        for crop in crops:
-            if crop.key not in self._cache:
-                by_size.setdefault(crop.size, {})[crop.key] = crop
-        for same_size in by_size.values():
-            missing = list(same_size.values())
-            for start in range(0, len(missing), self.batch_size):
-                batch = missing[start : start + self.batch_size]
-                for crop, features in zip(batch, self._extract(batch), strict=True):
-                    self._keep(crop, features)
+        return aligned(crop0, crop1, matches) if self.photometric else matches
 
     def _extract(self, crops: Sequence[Crop]) -> list[_Features]:
         """The features of crops of one size, which go through the network together."""
         width, height = crops[0].size
-        self.pixels_extracted += len(crops) * width * height
         gray = torch.stack([torch.from_numpy(crop.pixels()).to(self.device).float().mean(-1) for crop in crops])
         budget = max(MIN_FEATURES, round(self.features_per_megapixel * width * height / 1e6))
         scales = [self._extract_at(scale, round(share * budget), gray, crops) for scale, share in self.shares if share]
@@ -216,14 +193,13 @@ class XFeatStar:
         return OFFSET_GAIN * expected * here.steps, shares.amax(-1)
 
 
-def _load(path: Path) -> XFeatModel:
+def load_xfeat(path: Path, *, sparse: bool) -> XFeatModel:
+    """XFeat's network with the weights of a file, ready to run; its keypoints only when `sparse`."""
     net = XFeatModel()
-    try:
-        net.load_state_dict(torch.load(path, map_location="cpu", weights_only=True), strict=True)
-    except Exception as error:  # torch raises a different type for every way in which a file can be wrong
-        raise WeightsError(f"'{path}' cannot be loaded as XFeat weights ({str(error).splitlines()[0]})") from error
+    fill(net, read_tensors(path, "XFeat"), path, "XFeat")
     net.eval().requires_grad_(False)
-    net.keypoint_head = nn.Sequential()  # serves the sparse mode only
+    if not sparse:
+        net.keypoint_head = nn.Sequential()
     for layers in [module for module in net.modules() if isinstance(module, nn.Sequential)]:
         for i, norm in enumerate(layers):  # folding saves a pass over the largest maps
             if isinstance(norm, nn.BatchNorm2d):
@@ -262,20 +238,3 @@ def _mutual_nearest(
 def _first_of_each(values: Tensor) -> Tensor:
     _, first = np.unique(values.cpu().numpy(), return_index=True)
     return torch.from_numpy(np.sort(first)).to(values.device)
-
-
-def _aligned(crop0: Crop, crop1: Crop, matches: Matches) -> Matches:
-    """The matches with their second points moved to where the patches agree; where they do not, as they were.
-
-    The scores fall by the share of the patches that does not correlate.
-    """
-    gray0, gray1 = (cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY).astype(np.float32) for crop in (crop0, crop1))
-    affines = local_affines(matches.points0, matches.points1)
-    points1, correlations = refine(gray0, gray1, matches.points0, matches.points1, affines, strides=(1,))
-    near = np.linalg.norm(points1 - matches.points1, axis=1) < MAX_SHIFT
-    better = near & (correlations > MIN_CORRELATION) & wanted(crop1, points1)
-    return replace(
-        matches,
-        points1=np.where(better[:, None], points1, matches.points1),
-        scores=matches.scores * (1 + correlations) / 2,
-    )

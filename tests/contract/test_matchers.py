@@ -1,35 +1,49 @@
 """What every registered point matcher must do, whatever it is made of."""
 
-from functools import cache
+from functools import cache, partial
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from sgam_core.errors import WeightsError
 from sgam_core.types import Box, Crop, Matches
+from sgam_sfm import models
 from sgam_sfm.registry import available, create
 from tests.paths import weights_of
 from tests.textures import similarity, transfer, view, whole
 
 SIZE = (320, 240)
+MAX_FEATURES = 512  # of a crop, for those that take a bound: enough here, and quick
+BATCHES = {"batch": 3, "batch_size": 3, "batch_pixels": 2**20}  # by whatever name a matcher takes it
+SHIFT = 7.25
+CARDS = {card.name: card for card in models.CARDS}
 WARP = similarity(1.1, 6, (7.3, -4.6), (160, 120))
 
 
 @cache
-def _made(name: str):
-    return create("matcher", name, weights=weights_of(name))
+def _made(name: str, **settings: int):
+    return create("matcher", name, weights=weights_of(name), max_features=MAX_FEATURES, **settings)
 
 
 @pytest.fixture(params=list(available("matcher")))
-def matcher(request):
+def make(request):
+    """Makes one of the matchers. Crops of other content have other names, so that what it keeps serves all tests."""
+    missing = [module for module in CARDS[request.param].modules if find_spec(module) is None]
+    if missing:
+        pytest.skip(f"{request.param}: {', '.join(missing)} is not installed")
     try:
-        made = _made(request.param)
+        _made(request.param)
     except WeightsError as error:
         variable = "SGAM_SFM_LOFTR_WEIGHTS" if request.param == "loftr" else "SGAM_SFM_WEIGHTS"
         pytest.skip(f"{request.param}: {error}; or set {variable}")
-    if hasattr(made, "reset"):
-        made.reset()
-    return made
+    return partial(_made, request.param)
+
+
+@pytest.fixture
+def matcher(make):
+    return make()
 
 
 @cache
@@ -49,8 +63,12 @@ def check(matches: Matches, crop0: Crop, crop1: Crop) -> None:
         assert points.shape == (len(matches), 2)
         assert np.isfinite(points).all()
         assert ((points >= 0) & (points < crop.size)).all()
-    assert matches.scores.dtype == np.float32
+    for values in (matches.scores, matches.sigmas0, matches.sigmas1):
+        assert values.dtype == np.float32
+        assert values.shape == (len(matches),)
+        assert np.isfinite(values).all()
     assert ((matches.scores >= 0) & (matches.scores <= 1)).all()
+    assert (matches.sigmas >= 1).all()
 
 
 def assert_equal(a: Matches, b: Matches) -> None:
@@ -70,14 +88,47 @@ def test_known_warp_is_recovered_below_a_pixel(matcher, pair):
     assert (errors(matches) < 3).mean() > 0.9
 
 
+def test_a_known_shift_comes_back_in_corner_origin(matcher, pair):
+    # The texture is known between pixels, so nothing is resampled. A view of three quarters the size tells the origins
+    # apart: half a pixel too much on both sides is an eighth of one there.
+    moved = np.eye(3)
+    moved[0, 2] = SHIFT
+    shifted = whole(view(moved, SIZE), "shifted")
+    (matches,) = matcher.match([(pair[0], shifted)])
+    check(matches, pair[0], shifted)
+    offsets = matches.points1 - matches.points0
+    near = np.linalg.norm(offsets - (SHIFT, 0), axis=1) < 1
+    assert near.mean() > 0.9
+    assert np.abs(np.median(offsets, axis=0) - (SHIFT, 0)).max() < 0.1
+    assert np.abs(offsets[near].mean(0) - (SHIFT, 0)).max() < 0.1
+
+    small = whole(view(np.diag([0.75, 0.75, 1]), (240, 180)), "smaller")
+    (matches,) = matcher.match([(pair[0], small)])
+    assert len(matches) > 20
+    assert np.abs(np.median(matches.points1 - 0.75 * matches.points0, axis=0)).max() < 0.1
+
+
+def test_a_batch_equals_one_by_one(make, pair):
+    matcher = make(**BATCHES)
+    pairs = [pair, pair[::-1], (pair[0], pair[0])]
+    together = matcher.match(pairs)
+    for crops, batched in zip(pairs, together, strict=True):
+        (alone,) = matcher.match([crops])
+        assert len(alone) > 20
+        assert abs(len(alone) - len(batched)) <= 0.01 * len(alone)
+        joined = cKDTree(np.hstack([batched.points0, batched.points1]))
+        distances, _ = joined.query(np.hstack([alone.points0, alone.points1]), p=np.inf)
+        assert (distances < 1e-3).mean() >= 0.99
+
+
 def test_nothing_asked_nothing_returned(matcher):
     assert matcher.match([]) == []
 
 
 @pytest.mark.parametrize("level", [0, 128])
 def test_blank_images(matcher, pair, level):
-    blank = whole(np.full((240, 320, 3), level, np.uint8), "blank")
-    other = whole(np.full((100, 200, 3), level, np.uint8), "other")
+    blank = whole(np.full((240, 320, 3), level, np.uint8), f"blank {level}")
+    other = whole(np.full((100, 200, 3), level, np.uint8), f"other {level}")
     for crops in ((blank, blank), (blank, other), (pair[0], blank)):
         check(matcher.match([crops])[0], *crops)
 
@@ -124,7 +175,7 @@ def test_equal_input_gives_equal_bits(matcher, pair):
 
 
 def test_a_list_is_matched_as_its_pairs_are_and_in_their_order(matcher, pair):
-    blank = whole(np.full((100, 200, 3), 90, np.uint8), "blank")
+    blank = whole(np.full((100, 200, 3), 90, np.uint8), "gray")
     part = Crop(image=pair[0].image, window=Box(x0=60, y0=40, x1=260, y1=200), size=(200, 160))
     pairs = [(pair[0], pair[1]), (part, pair[1]), (blank, pair[0]), (pair[0], part)]
     together = matcher.match(pairs)

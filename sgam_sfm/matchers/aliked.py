@@ -1,0 +1,81 @@
+"""ALIKED with LightGlue, on kornia's models (Zhao et al., TIM 2023; Lindenberger et al., ICCV 2023)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from kornia import feature
+from torch import Tensor
+
+from sgam_core.types import Crop
+from sgam_sfm.machine import find_device
+from sgam_sfm.matchers.frames import ready, rgb_frames
+from sgam_sfm.matchers.lightglue import LightGlueAssignment
+from sgam_sfm.matchers.peaks import parabola, peaks
+from sgam_sfm.matchers.sparse import Features, SparseMatcher, batch_size, checked_count
+from sgam_sfm.matchers.state_dicts import fill, read_tensors
+from sgam_sfm.matchers.subpixel import aligned
+from sgam_sfm.weights import ALIKED, ALIKED_LIGHTGLUE, find_all_weights
+
+MODEL = "aliked-n16"
+CHANNELS = 128
+MULTIPLE = 32
+MIN_SIDE = 32  # pixels of a crop, below which there are no features
+_GRID = "dkd.hw_grid"  # a constant of the architecture, in no file
+
+
+class ALIKEDExtractor:
+    """ALIKED features of crops, the strongest `max_features`."""
+
+    def __init__(self, path: Path, max_features: int, device: torch.device) -> None:
+        net = feature.ALIKED(MODEL)
+        fill(net, {_GRID: net.state_dict()[_GRID]} | read_tensors(path, "ALIKED"), path, "ALIKED")
+        self._net = ready(net, device)
+        self._count = checked_count(max_features)
+        self._device = device
+
+    def __call__(self, crops: Sequence[Crop]) -> list[Features]:
+        if min(crops[0].size) < MIN_SIDE:
+            return [Features.none(crop, CHANNELS, self._device) for crop in crops]
+        maps, scores = self._net.extract_dense_map(rgb_frames(crops, MULTIPLE, self._device))
+        return [self._features(*each) for each in zip(crops, maps, scores[:, 0], strict=True)]
+
+    def _features(self, crop: Crop, dense: Float[Tensor, "C h w"], scores: Float[Tensor, "h w"]) -> Features:
+        pixels = peaks(scores, crop, self._count, minimum=0)
+        if not len(pixels):
+            return Features.none(crop, CHANNELS, self._device)
+        points = pixels + parabola(torch.logit(scores, eps=1e-6), pixels)
+        sides = torch.tensor([scores.shape[1] - 1, scores.shape[0] - 1], device=self._device)
+        (descriptors,), _ = self._net.desc_head(dense[None], [2 * points / sides - 1])
+        return Features.of(points + 0.5, descriptors, crop)
+
+
+def aliked_lightglue(
+    *,
+    weights: Path | None = None,
+    device: str = "cpu",
+    seed: int = 0,
+    max_features: int = 2048,
+    min_score: float = 0.1,
+    photometric: bool = True,
+    batch: int = 0,
+) -> SparseMatcher:
+    """ALIKED (n16) with LightGlue.
+
+    Args: weights: a folder with both files under their own names; found by itself when omitted. device: a torch device.
+        seed: accepted as by every matcher, but nothing here is random. max_features: of a crop, by score. min_score:
+        matches exceed it. photometric: align the patches of the matches in the end, on the CPU. batch: crops, or pairs,
+        that go through a network together; 0: 1 on the CPU, 8 elsewhere.
+    Raises: WeightsError when there are no weights or they are not those of the models; OptionError for wrong options.
+    """
+    place, files = find_device(device), find_all_weights((ALIKED, ALIKED_LIGHTGLUE), weights)
+    together = batch_size(place, batch)
+    return SparseMatcher(
+        ALIKEDExtractor(files[0], max_features, place),
+        LightGlueAssignment(files[1], place, batch_size=together, min_score=min_score, input_dim=CHANNELS),
+        refine=aligned if photometric else None,
+        batch_size=together,
+    )

@@ -1,0 +1,84 @@
+"""Features of crops, extracted once and kept while there is room."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Generic, Protocol, TypeVar, runtime_checkable
+
+from sgam_core.types import Crop
+
+
+@runtime_checkable
+class Sized(Protocol):
+    """Something that knows how much memory it takes."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes."""
+        ...
+
+
+F = TypeVar("F", bound=Sized)
+
+
+class FeatureCache(Generic[F]):
+    """Features by crop; the least recently used are dropped first.
+
+    Crops of equal size are extracted together, `batch_size` at most: with 1, what a crop gives does not depend on what
+    else is asked for or kept.
+
+    Args:
+        extract: the features of crops of one size.
+        batch_size: crops that are extracted together.
+        max_bytes: bound of what is kept; the last crop is kept whatever it takes.
+
+    Attributes:
+        pixels_extracted: crop pixels extracted so far, for cost reports.
+    """
+
+    def __init__(self, extract: Callable[[Sequence[Crop]], list[F]], *, batch_size: int, max_bytes: int) -> None:
+        self.batch_size = batch_size
+        self.max_bytes = max_bytes
+        self.pixels_extracted = 0
+        self._extract = extract
+        self._kept: OrderedDict[tuple, F] = OrderedDict()
+
+    @property
+    def keys(self) -> list[tuple]:
+        """Of the crops whose features are kept, least recently used first."""
+        return list(self._kept)
+
+    @property
+    def nbytes(self) -> int:
+        """Of all that is kept."""
+        return sum(features.nbytes for features in self._kept.values())
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._kept.clear()
+
+    def fetch(self, crops: Sequence[Crop]) -> None:
+        """Extract those that are not kept yet, in batches of equal size."""
+        by_size: dict[tuple[int, int], dict[tuple, Crop]] = {}
+        for crop in crops:
+            if crop.key not in self._kept:
+                by_size.setdefault(crop.size, {})[crop.key] = crop
+        for same_size in by_size.values():
+            missing = list(same_size.values())
+            for start in range(0, len(missing), self.batch_size):
+                self._add(missing[start : start + self.batch_size])
+
+    def of(self, crop: Crop) -> F:
+        """The features of a crop, extracted now when they are not kept."""
+        if crop.key not in self._kept:  # dropped since, or larger than the cache
+            self._add([crop])
+        self._kept.move_to_end(crop.key)
+        return self._kept[crop.key]
+
+    def _add(self, crops: Sequence[Crop]) -> None:
+        self.pixels_extracted += sum(crop.size[0] * crop.size[1] for crop in crops)
+        for crop, features in zip(crops, self._extract(crops), strict=True):
+            self._kept[crop.key] = features
+            while self.nbytes > self.max_bytes and len(self._kept) > 1:
+                self._kept.popitem(last=False)
