@@ -365,6 +365,15 @@ def _check_matches(pair: Pair, indices: np.ndarray, counts: tuple[int, int]) -> 
             raise ShapeError(f"matches of {pair} use a keypoint of '{pair[side]}' more than once; expected one-to-one")
 
 
+def copy_database(source: Path, target: Path) -> None:
+    """Copy a database with what is still in its journal; an older `target` is replaced once the copy is whole.
+
+    Raises: InputError when there is none; StageError when it cannot be read.
+    """
+    with _replacing(target) as partial:
+        _copy(source, partial)
+
+
 def _copy(source: Path, target: Path) -> None:
     """Copy an SQLite file with what is still in its journal."""
     if not source.is_file():

@@ -88,8 +88,8 @@ class MatchOptions:
     """Parameters for each image: a COLMAP model, or lines `name MODEL width height params...` (`*`: all images)."""
     refine_intrinsics: bool = False
     """Let mapping refine parameters that were given explicitly."""
-    mapper: Literal["incremental", "global"] = "incremental"
-    """COLMAP's incremental mapper, or its global one (GLOMAP)."""
+    mapper: Literal["incremental", "global", "hierarchical"] = "incremental"
+    """COLMAP's incremental mapper; its global one (GLOMAP); the hierarchical one, for thousands of images."""
     mapping: bool = True
     """Make a model; --no-mapping stops after the geometric verification."""
 

@@ -3,39 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from sgam_core import Matches, PointMatcher
+from sgam_core import PointMatcher
 from sgam_core.errors import OptionError
-from sgam_core.geometry import residuals
+from sgam_sfm.assembly import build_models, merge_records, verify_pairs
 from sgam_sfm.database import write_database
 from sgam_sfm.files import write_json
-from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
 from sgam_sfm.inputs import Inputs, read_inputs
-from sgam_sfm.keypoints import merge_keypoints
 from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import find_device, peak_memory_mb, use_threads
-from sgam_sfm.mapping import (
-    MappingOptions,
-    MappingSummary,
-    VerificationOptions,
-    VerificationSummary,
-    map_images,
-    verify,
-)
+from sgam_sfm.mapping import MappingOptions, MappingSummary, VerificationOptions, VerificationSummary
 from sgam_sfm.matching import CollectionMatcher, create_area_matcher, create_matcher, match_blocks
 from sgam_sfm.options import NOT_IN_RESULTS, VERSION, MatchOptions, as_json, fingerprint
-from sgam_sfm.pairs import Pair, blocks
-from sgam_sfm.progress import Advance, Stages
+from sgam_sfm.pairs import blocks
+from sgam_sfm.progress import Stages
 from sgam_sfm.run_record import recording
-from sgam_sfm.store import PairRecord, PairStore
+from sgam_sfm.store import PairStore
 from sgam_sfm.summary import summarise_images, summarise_keypoints, summarise_pairs, versions
+
+KNOWN_CAMERAS = "known_cameras"
+"""In inputs.json: the images whose camera the user gave."""
 
 
 def match_collection(
@@ -68,11 +59,7 @@ def _match_collection(options: MatchOptions, stages: Stages, point_matcher: Poin
 
     with stages.stage("Merging keypoints", None):
         records = list(store.read_all(len(work)))
-        matches, inliers = stored_matches(records, options)
-        merged = merge_keypoints(matches, options.keypoints, inliers)
-        write_keypoints_h5(output / "keypoints.h5", merged.keypoints)
-        counts = {name: len(points) for name, points in merged.keypoints.items()}
-        write_matches_h5(output / "matches.h5", merged.matches, merged.scores, counts)
+        merged = merge_records(records, options.keypoints, options.geometry.max_residual, output)
         write_database(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
     verified, mapped = reconstruct(options, inputs, stages)
 
@@ -114,7 +101,8 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
                 )
             (options.output / "labels" / RECORD).unlink(missing_ok=True)  # nothing is matched yet: begin anew
     write_json(path, now)
-    known = {"images": inputs.digests, "failed": inputs.failed}
+    given = sorted(name for name, camera in inputs.cameras.items() if camera.known)
+    known = {"images": inputs.digests, "failed": inputs.failed, KNOWN_CAMERAS: given}
     listed = {"pairs": inputs.pairs.pairs, "left_out": inputs.pairs.unreadable}
     write_json(options.output / "inputs.json", known | listed)
     return PairStore(folder=options.output / "pairs", fingerprint=mark)
@@ -148,49 +136,20 @@ def _flags(options: dict[str, Any], prefix: str = "--") -> dict[str, Any]:
     return flat
 
 
-def stored_matches(
-    records: Sequence[PairRecord], options: MatchOptions
-) -> tuple[dict[Pair, Matches], dict[Pair, np.ndarray]]:
-    """The point matches of every pair that has any, and (M,) which of them agree with the pair's geometry."""
-    matches, inliers = {}, {}
-    for record in records:
-        if record.result is not None and len(record.result.matches):
-            matches[record.pair] = record.result.matches
-            model = record.result.two_view
-            if model is not None:
-                inliers[record.pair] = residuals(model.F, record.result.matches) <= options.geometry.max_residual
-    return matches, inliers
-
-
 def reconstruct(
     options: MatchOptions, inputs: Inputs, stages: Stages
 ) -> tuple[VerificationSummary, MappingSummary | None]:
     """COLMAP's verification, then its mapper unless --no-mapping."""
     database = options.output / "database.db"
-    with stages.stage("Verifying pairs", len(inputs.pairs.pairs)) as advance:
-        verification = VerificationOptions(seed=options.seed, threads=options.threads or -1)
-        verified = verify(database, verification, _relative(advance))
+    verified = verify_pairs(database, VerificationOptions(seed=options.seed, threads=options.threads or -1), stages)
     if not options.mapping:
         return verified, None
-    with stages.stage("Mapping", len(inputs.images)) as advance:
-        mapped = map_images(
-            database,
-            options.images,
-            options.output / "sparse",
-            MappingOptions(mapper=options.mapper, refine_intrinsics=options.refine_intrinsics, seed=options.seed),
-            _relative(advance),
-            known_camera_ids={camera.camera_id for camera in inputs.cameras.values() if camera.known},
-        )
+    mapped = build_models(
+        database,
+        options.images,
+        options.output / "sparse",
+        MappingOptions(mapper=options.mapper, refine_intrinsics=options.refine_intrinsics, seed=options.seed),
+        stages,
+        known_camera_ids={camera.camera_id for camera in inputs.cameras.values() if camera.known},
+    )
     return verified, mapped
-
-
-def _relative(advance: Advance) -> Callable[[str, int, int], None]:
-    """COLMAP's stages tell how far they are, a progress bar wants to know what is new."""
-    shown = 0
-
-    def progress(step: str, done: int, total: int) -> None:
-        nonlocal shown
-        advance(done - shown)
-        shown = done
-
-    return progress
