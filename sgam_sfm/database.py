@@ -38,13 +38,14 @@ class CameraOptions:
     model: a COLMAP camera model. params: its parameters for all images ("f,cx,cy,k" or numbers), None for the EXIF
     focal length or COLMAP's guess of 1.2 * max(width, height). mode: which images share a camera: auto (COLMAP's
     choice), single, per-folder, per-image. cameras: a file or COLMAP model with known cameras, see `read_cameras`; the
-    images it does not name follow the other options.
+    images it does not name follow the other options. database: an existing one; the images it has keep their cameras.
     """
 
     model: str = "SIMPLE_RADIAL"
     params: str | tuple[float, ...] | None = None
     mode: str = "auto"
     cameras: Path | None = None
+    database: Path | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in CAMERA_MODES:
@@ -100,20 +101,27 @@ def import_cameras(
 ) -> ImportedImages:
     """Make a new database with the images, their cameras, rigs and frames, and GPS positions from EXIF.
 
-    An existing database is replaced. Image ids do not depend on the order of `names`.
+    An existing database is replaced. Image ids do not depend on the order of `names`. When the options name a database,
+    the new one is a copy of it, with the images that it does not have.
 
-    Raises: InputError when a known camera does not have the size of its image, or the cameras cannot be read.
+    Raises: InputError when a known camera does not have the size of its image or is not the one that the options'
+        database has for it, or the cameras cannot be read.
     """
     options = options or CameraOptions()
     known = read_cameras(options.cameras, names) if options.cameras else {}
     with _replacing(database_path) as partial:
-        pycolmap.Database.open(partial).close()
-        for group, mode, model, params in _import_groups(names, known, options):
+        if options.database is not None:
+            _copy(options.database, partial)
+        with pycolmap.Database.open(partial) as database:
+            there = {image.name for image in database.read_all_images()}.intersection(names)
+        for group, mode, model, params in _import_groups([n for n in names if n not in there], known, options):
             reader = pycolmap.ImageReaderOptions()
             reader.camera_model, reader.camera_params = model, ",".join(map(repr, params or ()))
             with quiet():  # what COLMAP would print about unreadable images is returned as failures
                 pycolmap.import_images(partial, image_folder, mode, group, reader)
-        cameras = _read_cameras_of_images(partial, {*known} if options.params is None else {*names})
+        cameras = _read_cameras_of_images(partial, names, {*known} if options.params is None else {*names})
+        for name in sorted(there):
+            _refuse_another(name, cameras[name], known.get(name), options)
         failures, sizes = _failures(image_folder, sorted({*names} - {*cameras}))
         sizes |= {name: (info.width, info.height) for name, info in cameras.items()}
         for name, given in known.items():
@@ -125,12 +133,23 @@ def import_cameras(
     return ImportedImages(cameras=cameras, failures=failures)
 
 
+def camera_of_info(info: CameraInfo) -> pycolmap.Camera:
+    """COLMAP's own form of an image's camera."""
+    return pycolmap.Camera(
+        model=info.model,
+        width=info.width,
+        height=info.height,
+        params=info.params,
+        has_prior_focal_length=info.has_prior_focal,
+    )
+
+
 def camera_matrix(info: CameraInfo) -> Float[np.ndarray, "3 3"] | None:
     """Pinhole matrix (3, 3), corner origin, for the two-view geometry of matching; lens distortion is ignored.
 
     Returns: None when the focal length is not known, or the lens (fisheye, panorama) is no pinhole even roughly.
     """
-    camera = pycolmap.Camera(model=info.model, width=info.width, height=info.height, params=info.params)
+    camera = camera_of_info(info)
     if not info.has_prior_focal or not camera.is_perspective_pinhole():
         return None
     return np.asarray(camera.calibration_matrix(), np.float64)
@@ -143,7 +162,7 @@ def camera_of_part(
 
     Args: origin: (x0, y0) of the part in the image. part, size: its (width, height) there and after resizing.
     """
-    camera = pycolmap.Camera(model=info.model, width=info.width, height=info.height, params=info.params)
+    camera = camera_of_info(info)
     camera.principal_point_x -= origin[0]
     camera.principal_point_y -= origin[1]
     camera.width, camera.height = part
@@ -197,26 +216,33 @@ def write_database(
     Raises: ShapeError when an array has another shape, an index is out of range or used twice; InputError when a name
         is not in the database.
     """
-    with _replacing(path) as partial:
-        _copy(imported, partial)
+    with changing_copy(imported, path) as database:
+        database.clear_two_view_geometries()
+        database.clear_matches()
+        database.clear_descriptors()
+        database.clear_keypoints()
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        unknown = ({*keypoints} | {name for pair in matches for name in pair}) - {*ids}
+        if unknown:
+            raise InputError(f"image '{min(unknown)}' is not in {imported}; import its camera first")
+        for name, image_id in sorted(ids.items(), key=lambda item: item[1]):
+            points = keypoints.get(name, np.zeros((0, 2), np.float32))
+            check_keypoints(name, points)
+            database.write_keypoints(image_id, np.ascontiguousarray(points, np.float32))
+        for pair, indices in sorted(matches.items(), key=lambda item: sorted(ids[name] for name in item[0])):
+            check_matches(pair, indices, (len(keypoints.get(pair[0], ())), len(keypoints.get(pair[1], ()))))
+            if database.exists_matches(ids[pair[0]], ids[pair[1]]):
+                raise InputError(f"the pair {pair} has matches in both directions; give them in one")
+            database.write_matches(ids[pair[0]], ids[pair[1]], np.ascontiguousarray(indices, np.uint32))
+
+
+@contextmanager
+def changing_copy(source: Path, target: Path) -> Iterator[pycolmap.Database]:
+    """A copy of a database to change; it takes the place of `target` (which may be the source) when all went well."""
+    with _replacing(target) as partial:
+        _copy(source, partial)
         with pycolmap.Database.open(partial) as database:
-            database.clear_two_view_geometries()
-            database.clear_matches()
-            database.clear_descriptors()
-            database.clear_keypoints()
-            ids = {image.name: image.image_id for image in database.read_all_images()}
-            unknown = ({*keypoints} | {name for pair in matches for name in pair}) - {*ids}
-            if unknown:
-                raise InputError(f"image '{min(unknown)}' is not in {imported}; import its camera first")
-            for name, image_id in sorted(ids.items(), key=lambda item: item[1]):
-                points = keypoints.get(name, np.zeros((0, 2), np.float32))
-                _check_keypoints(name, points)
-                database.write_keypoints(image_id, np.ascontiguousarray(points, np.float32))
-            for pair, indices in sorted(matches.items(), key=lambda item: sorted(ids[name] for name in item[0])):
-                _check_matches(pair, indices, (len(keypoints.get(pair[0], ())), len(keypoints.get(pair[1], ()))))
-                if database.exists_matches(ids[pair[0]], ids[pair[1]]):
-                    raise InputError(f"the pair {pair} has matches in both directions; give them in one")
-                database.write_matches(ids[pair[0]], ids[pair[1]], np.ascontiguousarray(indices, np.uint32))
+            yield database
 
 
 def _parameters(model: str, params: str | Sequence[float | str] | None) -> tuple[float, ...] | None:
@@ -307,10 +333,22 @@ def _import_groups(
         yield group, single, camera.model, camera.params
 
 
-def _read_cameras_of_images(path: Path, known: Collection[str]) -> dict[str, CameraInfo]:
+def _refuse_another(name: str, info: CameraInfo, listed: KnownCamera | None, options: CameraOptions) -> None:
+    """A camera that was given for an image must be the one that the existing database has for it."""
+    given = (listed.model, listed.params) if listed else (options.model, options.params)
+    if given[1] is not None and given != (info.model, info.params):
+        raise InputError(
+            f"the camera of '{name}' is {info.model} {','.join(map(str, info.params))} in {options.database}, but "
+            f"{given[0]} {','.join(map(str, given[1]))} was given; leave out --cameras or --camera-params for images "
+            "that the database has"
+        )
+
+
+def _read_cameras_of_images(path: Path, names: Collection[str], known: Collection[str]) -> dict[str, CameraInfo]:
     with pycolmap.Database.open(path) as database:
         cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
         images = sorted(database.read_all_images(), key=lambda image: image.name)
+    names = frozenset(names)
     return {
         image.name: CameraInfo(
             image_id=image.image_id,
@@ -323,6 +361,7 @@ def _read_cameras_of_images(path: Path, known: Collection[str]) -> dict[str, Cam
             known=image.name in known,
         )
         for image in images
+        if image.name in names
     }
 
 
@@ -342,7 +381,8 @@ def _failures(image_folder: Path, names: Sequence[str]) -> tuple[dict[str, str],
     return reasons, sizes
 
 
-def _check_keypoints(name: str, points: np.ndarray) -> None:
+def check_keypoints(name: str, points: np.ndarray) -> None:
+    """Raises: ShapeError for anything but finite pixels (N, 2)."""
     # COLMAP accepts more columns than it documents and ends the process when it verifies them.
     if points.ndim != 2 or points.shape[1] != 2 or points.dtype.kind != "f":
         raise ShapeError(f"keypoints of '{name}' are {points.dtype} {points.shape}; expected float32 (N, 2)")
@@ -350,7 +390,8 @@ def _check_keypoints(name: str, points: np.ndarray) -> None:
         raise ShapeError(f"keypoints of '{name}' contain values that are not finite")
 
 
-def _check_matches(pair: Pair, indices: np.ndarray, counts: tuple[int, int]) -> None:
+def check_matches(pair: Pair, indices: np.ndarray, counts: tuple[int, int]) -> None:
+    """Raises: ShapeError for anything but one-to-one matches (M, 2) of so many keypoints."""
     # COLMAP checks none of this: out-of-range indices read foreign memory, repeated ones bend the geometry.
     if indices.ndim != 2 or indices.shape[1] != 2 or indices.dtype.kind not in "iu":
         raise ShapeError(f"matches of {pair} are {indices.dtype} {indices.shape}; expected uint32 (M, 2)")

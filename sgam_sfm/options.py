@@ -90,6 +90,11 @@ class MatchOptions:
     """Let mapping refine parameters that were given explicitly."""
     mapper: Literal["incremental", "global", "hierarchical"] = "incremental"
     """COLMAP's incremental mapper; its global one (GLOMAP); the hierarchical one, for thousands of images."""
+    database: Path | None = None
+    """COLMAP database to write into, changed only once all pairs are verified: keypoints and matches are appended to
+    those it has, other pairs stay as they are. Images that it does not have are added."""
+    append: bool = False
+    """Append keypoints also to images that have descriptors in --database, which then cover the first ones only."""
     mapping: bool = True
     """Make a model; --no-mapping stops after the geometric verification."""
 
@@ -172,7 +177,7 @@ class SegmentOptions:
 
 NOT_IN_RESULTS = frozenset(
     {"images", "pairs", "cameras", "output", "config", "threads", "verbose"}
-    | {"refine_intrinsics", "mapper", "mapping", "keypoints"}
+    | {"refine_intrinsics", "mapper", "mapping", "keypoints", "database", "append"}
 )
 """Options that the raw results of pairs do not follow from: a run can be continued with others. The images, pairs and
 cameras themselves count, wherever they are."""

@@ -135,6 +135,11 @@ def _run(options: ReconstructOptions | AggregateOptions) -> Source:
             "twice)"
         )
     if isinstance(options, AggregateOptions):
+        if results.options.get("database"):
+            raise OptionError(
+                f"'{results.folder}' was matched into --database '{results.options['database']}', where keypoints keep "
+                "their rows; start the same match with other --keypoints options and a --database without ours"
+            )
         waiting = {(a, b) for a, b in inputs["pairs"]} - results.blocks.keys()
         if waiting:
             raise InputError(

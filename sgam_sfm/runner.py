@@ -9,6 +9,7 @@ from typing import Any
 
 from sgam_core import PointMatcher
 from sgam_core.errors import OptionError
+from sgam_sfm.appending import Stamp, append_to_database, replace_database, stamp_of
 from sgam_sfm.assembly import build_models, merge_records, verify_pairs
 from sgam_sfm.database import write_database
 from sgam_sfm.files import write_json
@@ -50,6 +51,7 @@ def _match_collection(options: MatchOptions, stages: Stages, point_matcher: Poin
     needs_labels = create_area_matcher(options).needs_labels or bool(options.mask_matches)
     output = options.output
 
+    existing = None if options.database is None else _stamp(options.database, output)
     inputs = read_inputs(options, stages)
     store = open_store(options, inputs)
     labels = make_label_maps(options, inputs.images, stages) if needs_labels else None
@@ -60,8 +62,9 @@ def _match_collection(options: MatchOptions, stages: Stages, point_matcher: Poin
     with stages.stage("Merging keypoints", None):
         records = list(store.read_all(len(work)))
         merged = merge_records(records, options.keypoints, options.geometry.max_residual, output)
-        write_database(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
-    verified, mapped = reconstruct(options, inputs, stages)
+        write = write_database if existing is None else append_to_database
+        write(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
+    verified, mapped = reconstruct(options, inputs, stages, existing)
 
     summary = {
         "images": summarise_images(inputs),
@@ -136,12 +139,27 @@ def _flags(options: dict[str, Any], prefix: str = "--") -> dict[str, Any]:
     return flat
 
 
+def _stamp(database: Path, output: Path) -> Stamp:
+    if database.resolve() == (output / "database.db").resolve():
+        raise OptionError(f"--database '{database}' is what the run writes itself; leave it out, or choose another one")
+    return stamp_of(database)
+
+
 def reconstruct(
-    options: MatchOptions, inputs: Inputs, stages: Stages
+    options: MatchOptions, inputs: Inputs, stages: Stages, existing: Stamp | None = None
 ) -> tuple[VerificationSummary, MappingSummary | None]:
-    """COLMAP's verification, then its mapper unless --no-mapping."""
+    """COLMAP's verification, then its mapper unless --no-mapping.
+
+    Args: existing: stamp of the --database that OUT/database.db was made from, which it replaces once it is verified.
+    """
     database = options.output / "database.db"
-    verified = verify_pairs(database, VerificationOptions(seed=options.seed, threads=options.threads or -1), stages)
+    verification = VerificationOptions(seed=options.seed, threads=options.threads or -1)
+    verified = verify_pairs(database, verification, stages, anew=existing is None)
+    if options.database is not None and existing is not None:
+        replace_database(options.database, database, existing)
+        ours = {frozenset(pair) for pair in inputs.pairs.pairs}
+        inliers = {pair: count for pair, count in verified.inliers.items() if frozenset(pair) in ours}
+        verified = replace(verified, inliers=inliers)
     if not options.mapping:
         return verified, None
     mapped = build_models(

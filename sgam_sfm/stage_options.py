@@ -77,3 +77,58 @@ class AggregateOptions(_ModelOptions):
     """Make a model; --no-mapping stops after the geometric verification."""
     keypoints: KeypointOptions = field(default_factory=KeypointOptions)
     """Merging the points of all pairs into keypoints."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalizeOptions:
+    """Poses of new photos in the model of a match run, found with the same matcher, areas and parameters.
+
+    Writes poses.txt (name qw qx qy qz tx ty tz), poses.csv, sparse/0 (the model with the new photos) and localize.json.
+    The same command started again continues where it stopped.
+    """
+
+    results: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    """The --output folder of the match run: its images are the references."""
+    images: Path
+    """Folder of the photos to localize; sub-folders are searched too."""
+    output: Path
+    """Folder for the results; made when missing."""
+    model: Path | None = None
+    """COLMAP model to localize in, of the run's images (without it: OUT/sparse/0)."""
+    reference_images: Path | None = None
+    """Folder of the run's images, where it is no longer the one that the run was given."""
+    pairs: Path | None = None
+    """Text file with `photo reference` a line. Without it: each photo with all references, up to 60 of them."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP's camera model of the photos."""
+    camera_params: str = ""
+    """Its parameters, comma-separated; without them EXIF's focal length, or one that is estimated."""
+    camera_mode: Literal["auto", "single", "per-folder", "per-image"] = "auto"
+    """Which photos share a camera."""
+    cameras: Path | None = None
+    """Parameters for each photo, as for `match`."""
+    labels: Path | None = None
+    """Label maps of the photos and the references, for a run with --labels; photos without any are matched whole."""
+    area_matcher: str = ""
+    """Another area matcher than the run's: none is the fastest."""
+    radius_px: float = 3.0
+    """A match within it of a reference's keypoint shows the same point, in pixels of the point matcher."""
+    max_error_px: float = 12.0
+    """Reprojection error of an inlier, in pixels of the photo."""
+    min_inliers: int = 15
+    """Points of the model that a pose must agree with."""
+    device: str = "auto"
+    """auto, cpu, cuda, cuda:1, ..."""
+    threads: int = 0
+    """CPU threads (0: all cores)."""
+    seed: int = 0
+    """Seed of the pose estimation."""
+    verbose: bool = False
+    """Show the log on the terminal; it is always in OUTPUT/log.txt."""
+
+    def __post_init__(self) -> None:
+        for name in ("radius_px", "max_error_px"):
+            if not getattr(self, name) > 0:
+                raise OptionError(f"--{name.replace('_', '-')} is {getattr(self, name)}; expected more than 0 pixels")
+        if self.min_inliers < 4:
+            raise OptionError(f"--min-inliers is {self.min_inliers}; expected at least 4, since 3 points fit any pose")
