@@ -11,7 +11,7 @@ import sqlite3
 import zlib  # noqa: F401  (before pycolmap, whose wheel carries a zlib of its own: loaded later, ours would mix the two)
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -22,6 +22,7 @@ from sgam_core.errors import InputError, OptionError, ShapeError, StageError
 from sgam_sfm.colmap_reading import quiet, read_model
 from sgam_sfm.files import replacing, require_space
 from sgam_sfm.pairs import Pair
+from sgam_sfm.rigs import Rigs, apply_rigs, read_rigs
 
 logger = logging.getLogger(__name__)
 
@@ -38,16 +39,20 @@ class CameraOptions:
     model: a COLMAP camera model. params: its parameters for all images ("f,cx,cy,k" or numbers), None for the EXIF
     focal length or COLMAP's guess of 1.2 * max(width, height). mode: which images share a camera: auto (COLMAP's
     choice), single, per-folder, per-image. cameras: a file or COLMAP model with known cameras, see `read_cameras`; the
-    images it does not name follow the other options. database: an existing one; the images it has keep their cameras.
+    images it does not name follow the other options. rigs: COLMAP's rig configuration; images of one of its prefixes
+    share a camera. database: an existing one; the images it has keep their cameras.
     """
 
     model: str = "SIMPLE_RADIAL"
     params: str | tuple[float, ...] | None = None
     mode: str = "auto"
     cameras: Path | None = None
+    rigs: Path | None = None
     database: Path | None = None
 
     def __post_init__(self) -> None:
+        if self.rigs is not None and self.database is not None:
+            raise OptionError("--rigs would change the rigs of --database; apply them there with COLMAP, leave one out")
         if self.mode not in CAMERA_MODES:
             raise OptionError(f"camera mode '{self.mode}' is unknown; choose one of {', '.join(CAMERA_MODES)}")
         try:
@@ -58,12 +63,13 @@ class CameraOptions:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class KnownCamera:
-    """A camera that the user gave."""
+    """A camera that the user gave. folder: whose images share it with no others, empty for any that have equal ones."""
 
     model: str
     params: tuple[float, ...]
     width: int
     height: int
+    folder: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -109,17 +115,24 @@ def import_cameras(
     """
     options = options or CameraOptions()
     known = read_cameras(options.cameras, names) if options.cameras else {}
+    rigs = read_rigs(options.rigs, names) if options.rigs else None
     with _replacing(database_path) as partial:
         if options.database is not None:
             _copy(options.database, partial)
         with pycolmap.Database.open(partial) as database:
             there = {image.name for image in database.read_all_images()}.intersection(names)
-        for group, mode, model, params in _import_groups([n for n in names if n not in there], known, options):
+        for group, mode, model, params in _import_groups(
+            [name for name in names if name not in there], known, options, rigs
+        ):
             reader = pycolmap.ImageReaderOptions()
             reader.camera_model, reader.camera_params = model, ",".join(map(repr, params or ()))
             with quiet():  # what COLMAP would print about unreadable images is returned as failures
                 pycolmap.import_images(partial, image_folder, mode, group, reader)
-        cameras = _read_cameras_of_images(partial, names, {*known} if options.params is None else {*names})
+        known_names = {*known} if options.params is None else {*names}
+        if rigs is not None:
+            apply_rigs(partial, rigs)
+            known_names |= rigs.with_given_camera(names)
+        cameras = _read_cameras_of_images(partial, names, known_names)
         for name in sorted(there):
             _refuse_another(name, cameras[name], known.get(name), options)
         failures, sizes = _failures(image_folder, sorted({*names} - {*cameras}))
@@ -186,14 +199,25 @@ def read_cameras(path: Path, names: Sequence[str]) -> dict[str, KnownCamera]:
     """Read known cameras: a text file, or a folder with a COLMAP model (text or binary) whose images have our names.
 
     A line of the text file is `name MODEL width height params...`, hloc's list of images with intrinsics: the image's
-    name, or `*` for every image that has no line of its own; a tab after a name that contains spaces; `#` comments and
-    blank lines are skipped. Images with equal cameras share one.
+    name, `folder/*` for the images of a folder and its sub-folders, or `*` for every image, where no line is closer to
+    it; a tab after a name that contains spaces; `#` comments and blank lines are skipped. Images with equal cameras
+    share one, but for those of different `folder/*` lines.
+
+    COLMAP's own cameras.txt is understood too: a single camera is that of all images; which image has which of several
+    is read from images.txt beside it.
 
     Args: names: the images of the collection; cameras of other images are left out, with a warning.
     Raises: InputError when the file or a line cannot be used, or no camera belongs to any of the images.
     """
     cameras = _model_cameras(path) if path.is_dir() else _listed_cameras(path)
+    if cameras and all(name.isdecimal() for name in cameras):
+        cameras = _numbered_cameras(path, cameras)
     everyone = cameras.pop("*", None)
+    folders = {name[:-1]: replace(cameras.pop(name), folder=name[:-1]) for name in sorted(cameras) if name[-2:] == "/*"}
+    for name in names:
+        within = [folder for folder in folders if name.startswith(folder)]
+        if within and name not in cameras:
+            cameras[name] = folders[max(within, key=len)]
     others = sorted(set(cameras) - set(names))
     if others:
         logger.warning("%s names %d images that are not in the collection, such as '%s'", path, len(others), others[0])
@@ -307,16 +331,42 @@ def _listed_cameras(path: Path) -> dict[str, KnownCamera]:
     return cameras
 
 
+def _numbered_cameras(path: Path, cameras: Mapping[str, KnownCamera]) -> dict[str, KnownCamera]:
+    """The cameras of COLMAP's cameras.txt by image name."""
+    if len(cameras) == 1:
+        return {"*": next(iter(cameras.values()))}
+    images = path.with_name("images.txt")
+    if not images.is_file():
+        raise InputError(
+            f"{path} has {len(cameras)} cameras, and no images.txt beside it says which image has which; put it there, "
+            "or write lines `name MODEL width height params...` with names, `folder/*` or `*`"
+        )
+    named = {}
+    lines = [line for line in images.read_text(encoding="utf-8-sig").splitlines() if not line.startswith("#")]
+    for line in filter(str.strip, lines[::2]):  # a line of points, which may be empty, follows each
+        fields = line.split(maxsplit=9)
+        if len(fields) != 10 or fields[8] not in cameras:
+            raise InputError(
+                f"{images}: '{line}' names no camera of {path}; expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            )
+        named[fields[9].strip()] = cameras[fields[8]]
+    return named
+
+
 def _import_groups(
-    names: Sequence[str], known: Mapping[str, KnownCamera], options: CameraOptions
+    names: Sequence[str], known: Mapping[str, KnownCamera], options: CameraOptions, rigs: Rigs | None
 ) -> Iterator[tuple[list[str], pycolmap.CameraMode, str, Sequence[float] | None]]:
     """Images that are imported together: names, camera mode, model and parameters."""
     single = pycolmap.CameraMode.SINGLE
-    by_camera: dict[KnownCamera, list[str]] = {}
+    by_camera: dict[tuple[KnownCamera, str], list[str]] = {}
     by_folder: dict[str, list[str]] = {}
+    by_prefix: dict[str, list[str]] = {}
     for name in sorted(names):
+        prefix = rigs.prefix_of(name) if rigs else ""  # its images share a camera, even if another has equal parameters
         if name in known:
-            by_camera.setdefault(known[name], []).append(name)
+            by_camera.setdefault((known[name], prefix), []).append(name)
+        elif prefix:
+            by_prefix.setdefault(prefix, []).append(name)
         else:
             # COLMAP's own per-folder mode gives images that sort after a subfolder that subfolder's camera.
             folder = str(PurePosixPath(name).parent) if options.mode == "per-folder" else ""
@@ -329,7 +379,9 @@ def _import_groups(
     }[options.mode]
     for group in by_folder.values():
         yield group, mode, options.model, options.params  # type: ignore[misc]
-    for camera, group in by_camera.items():
+    for group in by_prefix.values():
+        yield group, single, options.model, options.params  # type: ignore[misc]
+    for (camera, _), group in by_camera.items():
         yield group, single, camera.model, camera.params
 
 

@@ -62,6 +62,7 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
                 params=options.camera_params or None,
                 mode=options.camera_mode,
                 cameras=options.cameras,
+                rigs=options.rigs,
                 database=options.database,
             ),
         )

@@ -141,6 +141,7 @@ def _options_of_run(options: LocalizeOptions, results: Results) -> MatchOptions:
         area_matcher=options.area_matcher or run.area_matcher,
         device=str(find_device(options.device, "--device")),
         threads=options.threads,
+        rigs=None,
         database=None,
         mapping=False,
     )

@@ -85,7 +85,10 @@ class MatchOptions:
     camera_mode: Literal["auto", "single", "per-folder", "per-image"] = "auto"
     """Which images share a camera."""
     cameras: Path | None = None
-    """Parameters for each image: a COLMAP model, or lines `name MODEL width height params...` (`*`: all images)."""
+    """Parameters for each image: a COLMAP model or cameras.txt, or lines `name MODEL width height params...` (`*`: all
+    images, `folder/*`: those of a folder)."""
+    rigs: Path | None = None
+    """COLMAP's rig configuration (JSON): cameras that are mounted together."""
     refine_intrinsics: bool = False
     """Let mapping refine parameters that were given explicitly."""
     mapper: Literal["incremental", "global", "hierarchical"] = "incremental"
@@ -176,7 +179,7 @@ class SegmentOptions:
 
 
 NOT_IN_RESULTS = frozenset(
-    {"images", "pairs", "cameras", "output", "config", "threads", "verbose"}
+    {"images", "pairs", "cameras", "rigs", "output", "config", "threads", "verbose"}
     | {"refine_intrinsics", "mapper", "mapping", "keypoints", "database", "append"}
 )
 """Options that the raw results of pairs do not follow from: a run can be continued with others. The images, pairs and

@@ -106,7 +106,7 @@ class LocalizeOptions:
     camera_mode: Literal["auto", "single", "per-folder", "per-image"] = "auto"
     """Which photos share a camera."""
     cameras: Path | None = None
-    """Parameters for each photo, as for `match`."""
+    """Parameters for each photo, as `match` reads them."""
     labels: Path | None = None
     """Label maps of the photos and the references, for a run with --labels; photos without any are matched whole."""
     area_matcher: str = ""
