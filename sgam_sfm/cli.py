@@ -28,13 +28,14 @@ from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED, MEANINGS, USAGE
 from sgam_sfm.files import disk_is_full
 from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.options import MatchOptions, SegmentOptions, starting_options
-from sgam_sfm.stage_options import AggregateOptions, LocalizeOptions, ReconstructOptions
+from sgam_sfm.stage_options import AggregateOptions, ExportOptions, LocalizeOptions, ReconstructOptions
 
 _COMMANDS = {
     MatchOptions: "match",
     ReconstructOptions: "reconstruct",
     AggregateOptions: "aggregate",
     LocalizeOptions: "localize",
+    ExportOptions: "export",
     CompareOptions: "compare",
     EvaluateOptions: "evaluate",
     SegmentOptions: "segment",

@@ -146,11 +146,9 @@ def _run(options: ReconstructOptions | AggregateOptions) -> Source:
                 f"{len(waiting)} of {len(inputs['pairs'])} pairs have no result in '{results.folder / 'pairs'}'; start "
                 "the same match again, it continues where it stopped"
             )
-    elif not (results.folder / "database.db").is_file():
-        raise InputError(f"'{results.folder}' has no database.db yet; start the same match again, it writes one")
     return Source(
         results=results.folder,
-        database=results.folder / "database.db",
+        database=results.folder / "database.db" if isinstance(options, AggregateOptions) else results.database(),
         images=results.images,
         output=options.output or results.folder,
         known_cameras=frozenset(inputs[KNOWN_CAMERAS]),

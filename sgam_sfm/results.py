@@ -127,6 +127,13 @@ class Results:
         """The names of labels that have one."""
         return {label.id: label.name for label in read_label_set(self.folder / "labels").labels if label.name}
 
+    def database(self) -> Path:
+        """The run's database. Raises: InputError when there is none yet."""
+        path = self.folder / "database.db"
+        if not path.is_file():
+            raise InputError(f"'{self.folder}' has no database.db yet; start the same match again, it writes one")
+        return path
+
     def inliers(self, pair: Pair) -> MatchedPoints | None:
         """The matches that COLMAP's verification left of a pair, None when it has not verified the pair."""
         database = self.folder / "database.db"

@@ -132,3 +132,19 @@ class LocalizeOptions:
                 raise OptionError(f"--{name.replace('_', '-')} is {getattr(self, name)}; expected more than 0 pixels")
         if self.min_inliers < 4:
             raise OptionError(f"--min-inliers is {self.min_inliers}; expected at least 4, since 3 points fit any pose")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Keypoints and matches of a run as COLMAP's text files, for feature_importer and matches_importer.
+
+    Writes keypoints/<image name>.txt and matches.txt. For hloc and its readers, a run has keypoints.h5 and matches.h5
+    in OUT already.
+    """
+
+    results: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    """The --output folder of a match run."""
+    output: Path
+    """Folder for the files; made when missing."""
+    images: Path | None = None
+    """Folder of the images, where it is no longer the one that the run was given."""
