@@ -33,7 +33,7 @@ def merge_records(
 ) -> CollectionKeypoints:
     """Keypoints from the raw matches of all pairs, in OUT/keypoints.h5 and OUT/matches.h5 too.
 
-    Args: max_residual: matches within it of their pair's geometry count as inliers, in matcher pixels.
+    Args: max_residual: of an inlier of its pair's geometry, see `GeometryOptions`.
     """
     matches, inliers = stored_matches(records, max_residual)
     merged = merge_keypoints(matches, options, inliers)
