@@ -33,16 +33,12 @@ def stamp_of(path: Path) -> Stamp:
     Raises: InputError when the file is missing, no COLMAP database, or made by a newer COLMAP than the one installed.
     """
     if not path.is_file():
-        raise InputError(f"--database '{path}' does not exist; without --database the run writes OUT/database.db")
+        raise InputError(f"--database '{path}' does not exist; give a COLMAP database, or leave --database out")
     made, ours = _version(path), _installed_version()
     if made > ours:
         raise InputError(
             f"--database '{path}' was made by a newer COLMAP (its version number is {made}, pycolmap "
             f"{pycolmap.__version__} writes {ours}); upgrade pycolmap"
-        )
-    if made < ours:
-        _log.warning(
-            "%s was made by an older COLMAP (version number %d): it will be in the format of %d", path, made, ours
         )
     files = (path, path.with_name(path.name + "-wal"))
     return tuple((file.stat().st_mtime_ns, file.stat().st_size) for file in files if file.exists())
@@ -106,6 +102,8 @@ def replace_database(path: Path, made: Path, before: Stamp) -> None:
             f"another program has written to --database '{path}' while this run lasted; start the same command again "
             "(no pair is matched twice)"
         )
+    if _version(path) < _version(made):
+        _log.warning("%s was made by an older COLMAP; it is now in the format of %s", path, pycolmap.__version__)
     copy_database(made, path)
 
 

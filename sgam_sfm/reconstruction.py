@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sgam_core.errors import InputError, OptionError
+from sgam_sfm.appending import stamp_of
 from sgam_sfm.assembly import build_models, merge_records, verify_pairs
 from sgam_sfm.colmap_reading import read_camera_ids
 from sgam_sfm.database import copy_database, write_database
@@ -170,6 +171,7 @@ def _any_database(options: ReconstructOptions) -> Source:
     )
     if source.database.resolve() == source.written.resolve():
         raise OptionError(f"--database '{source.database}' would be overwritten by its copy; choose another --output")
+    stamp_of(source.database)  # refuses what the installed COLMAP cannot read
     return source
 
 

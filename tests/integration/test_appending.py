@@ -125,7 +125,7 @@ def test_a_database_of_a_newer_colmap_is_refused(existing, tmp_path):
     (tmp_path / "text.db").write_text("no database" * 1000)
     with pytest.raises(InputError, match=r"text.db' is not a COLMAP database \(file is not a database\)"):
         stamp_of(tmp_path / "text.db")
-    with pytest.raises(InputError, match=r"none.db' does not exist; without --database the run writes OUT/database.db"):
+    with pytest.raises(InputError, match=r"none.db' does not exist; give a COLMAP database, or leave --database out"):
         stamp_of(tmp_path / "none.db")
 
 

@@ -171,7 +171,7 @@ WRONG = {
     "missing database": (
         ["reconstruct", "--database", "{tmp}/no.db", "--images", "{images}", "--output", "{tmp}/o"],
         ERROR,
-        "there is no database at {tmp}/no.db",
+        "--database '{tmp}/no.db' does not exist; give a COLMAP database",
     ),
     "its own copy": (
         ["reconstruct", "--database", "{tmp}/database.db", "--images", "{images}", "--output", "{tmp}"],
