@@ -17,10 +17,7 @@ from sgam_sfm.colmap_reading import read_poses_and_points
 from sgam_sfm.evaluation.ground_truth import camera_table
 from sgam_sfm.exit_codes import DONE, ERROR, NO_MODEL, SOME_FAILED, USAGE
 from sgam_sfm.room.rendering import View
-from sgam_sfm.scene import write_ground_truth
-from sgam_sfm.store import read_pairs_of
 from tests.arc import ARC, CAMERA, FOCAL, HEIGHT, WIDTH, ArcMatcher, view, write_arc
-from tests.room import Room, TrueMatcher, write_room
 
 NEW = {name: view(name, angle) for name, angle in (("new/x.png", 8.0), ("y.png", -17.0))}
 # So far to the side that it shows no point: the matcher finds outliers alone.
@@ -163,33 +160,3 @@ def test_wrong_input_is_one_line(finished, photos, tmp_path, capsys, case):
     assert cli.run([*given, *(argument.format(**names) for argument in arguments)]) == code
     (error,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
     assert expected.format(**names) in error
-
-
-def test_a_view_of_the_room_between_its_neighbours(room: Room, tmp_path, monkeypatch):
-    """With semantic areas: label maps of photo and references come from one folder."""
-    written = write_room(room, tmp_path / "room")
-    names = list(room.images)
-    photo = names[2]
-    (tmp_path / "photos").mkdir()
-    shutil.move(written / "images" / photo, tmp_path / "photos" / photo)
-    for other in (names[0], names[5]):
-        (written / "images" / other).unlink()
-    write_ground_truth(tmp_path, [room.views[name] for name in names])
-    out, matcher = tmp_path / "out", TrueMatcher(room, points=150)
-    options = MatchOptions(
-        images=written / "images", cameras=written / "cameras.txt", output=out, area_matcher="none", mapping=False
-    )
-    match_collection(options, point_matcher=matcher)
-    assert cli.run(["reconstruct", str(out), "--mapper", "triangulate", "--input-model", str(tmp_path)]) == DONE
-    monkeypatch.setattr("sgam_sfm.localization.create_matcher", lambda options: matcher)
-    given = ["--images", str(tmp_path / "photos"), "--output", str(tmp_path / "poses")]
-    given += ["--area-matcher", "sgam", "--labels", str(written / "labels")]
-    assert cli.run(["localize", str(out), *given, "--cameras", str(written / "cameras.txt")]) == DONE
-    poses, _ = read_poses_and_points(tmp_path / "poses/sparse/0")
-    angle, distance = errors(poses[photo], room.views[photo])
-    assert angle < 0.3
-    assert distance < 0.02  # metres
-    summary = json.loads((tmp_path / "poses/inputs.json").read_text())
-    assert set(summary["images"]) == {names[1], photo, names[3], names[4]}
-    areas = [area for record in read_pairs_of(tmp_path / "poses") for area in record.result.areas]
-    assert any(area.state == "kept" for area in areas)
