@@ -80,19 +80,29 @@ class ModelImage:
     track_lengths: Int[np.ndarray, " N"]
 
 
-def read_counts(path: Path) -> DatabaseCounts:
+def read_counts(path: Path, *, failed: bool = False) -> DatabaseCounts:
     """How many keypoints every image has, and how many inliers every pair that COLMAP verified.
 
+    Args: failed: give the pairs too that COLMAP looked at and found no geometry for, with 0 inliers.
     Raises: InputError when the file is missing or no COLMAP database.
     """
     with opened(path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
         pairs = zip(*database.read_two_view_geometry_num_inliers(), strict=True)
-        ids = ((pycolmap.pair_id_to_image_pair(pair_id), count) for pair_id, count in pairs if count > 0)
+        ids = ((pycolmap.pair_id_to_image_pair(pair_id), count) for pair_id, count in pairs if failed or count > 0)
         return DatabaseCounts(
             keypoints={name: database.num_keypoints_for_image(image_id) for image_id, name in names.items()},
             inliers={(names[id0], names[id1]): count for (id0, id1), count in ids},
         )
+
+
+def read_camera_ids(path: Path) -> dict[str, int]:
+    """The camera of every image, by name.
+
+    Raises: InputError when the file is missing or no COLMAP database.
+    """
+    with opened(path) as database:
+        return {image.name: image.camera_id for image in database.read_all_images()}
 
 
 def read_keypoints(path: Path, name: str) -> Float[np.ndarray, "N 2"] | None:

@@ -11,7 +11,7 @@ import sqlite3
 import zlib  # noqa: F401  (before pycolmap, whose wheel carries a zlib of its own: loaded later, ours would mix the two)
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -22,6 +22,7 @@ from sgam_core.errors import InputError, OptionError, ShapeError, StageError
 from sgam_sfm.colmap_reading import quiet, read_model
 from sgam_sfm.files import replacing, require_space
 from sgam_sfm.pairs import Pair
+from sgam_sfm.rigs import Rigs, apply_rigs, read_rigs
 
 logger = logging.getLogger(__name__)
 
@@ -38,15 +39,20 @@ class CameraOptions:
     model: a COLMAP camera model. params: its parameters for all images ("f,cx,cy,k" or numbers), None for the EXIF
     focal length or COLMAP's guess of 1.2 * max(width, height). mode: which images share a camera: auto (COLMAP's
     choice), single, per-folder, per-image. cameras: a file or COLMAP model with known cameras, see `read_cameras`; the
-    images it does not name follow the other options.
+    images it does not name follow the other options. rigs: COLMAP's rig configuration; images of one of its prefixes
+    share a camera. database: an existing one; the images it has keep their cameras.
     """
 
     model: str = "SIMPLE_RADIAL"
     params: str | tuple[float, ...] | None = None
     mode: str = "auto"
     cameras: Path | None = None
+    rigs: Path | None = None
+    database: Path | None = None
 
     def __post_init__(self) -> None:
+        if self.rigs is not None and self.database is not None:
+            raise OptionError("--rigs would change the rigs of --database; apply them there with COLMAP, leave one out")
         if self.mode not in CAMERA_MODES:
             raise OptionError(f"camera mode '{self.mode}' is unknown; choose one of {', '.join(CAMERA_MODES)}")
         try:
@@ -57,12 +63,13 @@ class CameraOptions:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class KnownCamera:
-    """A camera that the user gave."""
+    """A camera that the user gave. folder: whose images share it with no others, empty for any that have equal ones."""
 
     model: str
     params: tuple[float, ...]
     width: int
     height: int
+    folder: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -100,20 +107,34 @@ def import_cameras(
 ) -> ImportedImages:
     """Make a new database with the images, their cameras, rigs and frames, and GPS positions from EXIF.
 
-    An existing database is replaced. Image ids do not depend on the order of `names`.
+    An existing database is replaced. Image ids do not depend on the order of `names`. When the options name a database,
+    the new one is a copy of it, with the images that it does not have.
 
-    Raises: InputError when a known camera does not have the size of its image, or the cameras cannot be read.
+    Raises: InputError when a known camera does not have the size of its image or is not the one that the options'
+        database has for it, or the cameras cannot be read.
     """
     options = options or CameraOptions()
     known = read_cameras(options.cameras, names) if options.cameras else {}
+    rigs = read_rigs(options.rigs, names) if options.rigs else None
     with _replacing(database_path) as partial:
-        pycolmap.Database.open(partial).close()
-        for group, mode, model, params in _import_groups(names, known, options):
+        if options.database is not None:
+            _copy(options.database, partial)
+        with pycolmap.Database.open(partial) as database:
+            there = {image.name for image in database.read_all_images()}.intersection(names)
+        for group, mode, model, params in _import_groups(
+            [name for name in names if name not in there], known, options, rigs
+        ):
             reader = pycolmap.ImageReaderOptions()
             reader.camera_model, reader.camera_params = model, ",".join(map(repr, params or ()))
             with quiet():  # what COLMAP would print about unreadable images is returned as failures
                 pycolmap.import_images(partial, image_folder, mode, group, reader)
-        cameras = _read_cameras_of_images(partial, {*known} if options.params is None else {*names})
+        known_names = {*known} if options.params is None else {*names}
+        if rigs is not None:
+            apply_rigs(partial, rigs)
+            known_names |= rigs.with_given_camera(names)
+        cameras = _read_cameras_of_images(partial, names, known_names)
+        for name in sorted(there):
+            _refuse_another(name, cameras[name], known.get(name), options)
         failures, sizes = _failures(image_folder, sorted({*names} - {*cameras}))
         sizes |= {name: (info.width, info.height) for name, info in cameras.items()}
         for name, given in known.items():
@@ -125,12 +146,23 @@ def import_cameras(
     return ImportedImages(cameras=cameras, failures=failures)
 
 
+def camera_of_info(info: CameraInfo) -> pycolmap.Camera:
+    """COLMAP's own form of an image's camera."""
+    return pycolmap.Camera(
+        model=info.model,
+        width=info.width,
+        height=info.height,
+        params=info.params,
+        has_prior_focal_length=info.has_prior_focal,
+    )
+
+
 def camera_matrix(info: CameraInfo) -> Float[np.ndarray, "3 3"] | None:
     """Pinhole matrix (3, 3), corner origin, for the two-view geometry of matching; lens distortion is ignored.
 
     Returns: None when the focal length is not known, or the lens (fisheye, panorama) is no pinhole even roughly.
     """
-    camera = pycolmap.Camera(model=info.model, width=info.width, height=info.height, params=info.params)
+    camera = camera_of_info(info)
     if not info.has_prior_focal or not camera.is_perspective_pinhole():
         return None
     return np.asarray(camera.calibration_matrix(), np.float64)
@@ -143,7 +175,7 @@ def camera_of_part(
 
     Args: origin: (x0, y0) of the part in the image. part, size: its (width, height) there and after resizing.
     """
-    camera = pycolmap.Camera(model=info.model, width=info.width, height=info.height, params=info.params)
+    camera = camera_of_info(info)
     camera.principal_point_x -= origin[0]
     camera.principal_point_y -= origin[1]
     camera.width, camera.height = part
@@ -167,14 +199,25 @@ def read_cameras(path: Path, names: Sequence[str]) -> dict[str, KnownCamera]:
     """Read known cameras: a text file, or a folder with a COLMAP model (text or binary) whose images have our names.
 
     A line of the text file is `name MODEL width height params...`, hloc's list of images with intrinsics: the image's
-    name, or `*` for every image that has no line of its own; a tab after a name that contains spaces; `#` comments and
-    blank lines are skipped. Images with equal cameras share one.
+    name, `folder/*` for the images of a folder and its sub-folders, or `*` for every image, where no line is closer to
+    it; a tab after a name that contains spaces; `#` comments and blank lines are skipped. Images with equal cameras
+    share one, but for those of different `folder/*` lines.
+
+    COLMAP's own cameras.txt is understood too: a single camera is that of all images; which image has which of several
+    is read from images.txt beside it.
 
     Args: names: the images of the collection; cameras of other images are left out, with a warning.
     Raises: InputError when the file or a line cannot be used, or no camera belongs to any of the images.
     """
     cameras = _model_cameras(path) if path.is_dir() else _listed_cameras(path)
+    if cameras and all(name.isdecimal() for name in cameras):
+        cameras = _numbered_cameras(path, cameras)
     everyone = cameras.pop("*", None)
+    folders = {name[:-1]: replace(cameras.pop(name), folder=name[:-1]) for name in sorted(cameras) if name[-2:] == "/*"}
+    for name in names:
+        within = [folder for folder in folders if name.startswith(folder)]
+        if within and name not in cameras:
+            cameras[name] = folders[max(within, key=len)]
     others = sorted(set(cameras) - set(names))
     if others:
         logger.warning("%s names %d images that are not in the collection, such as '%s'", path, len(others), others[0])
@@ -197,26 +240,33 @@ def write_database(
     Raises: ShapeError when an array has another shape, an index is out of range or used twice; InputError when a name
         is not in the database.
     """
-    with _replacing(path) as partial:
-        _copy(imported, partial)
+    with changing_copy(imported, path) as database:
+        database.clear_two_view_geometries()
+        database.clear_matches()
+        database.clear_descriptors()
+        database.clear_keypoints()
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        unknown = ({*keypoints} | {name for pair in matches for name in pair}) - {*ids}
+        if unknown:
+            raise InputError(f"image '{min(unknown)}' is not in {imported}; import its camera first")
+        for name, image_id in sorted(ids.items(), key=lambda item: item[1]):
+            points = keypoints.get(name, np.zeros((0, 2), np.float32))
+            check_keypoints(name, points)
+            database.write_keypoints(image_id, np.ascontiguousarray(points, np.float32))
+        for pair, indices in sorted(matches.items(), key=lambda item: sorted(ids[name] for name in item[0])):
+            check_matches(pair, indices, (len(keypoints.get(pair[0], ())), len(keypoints.get(pair[1], ()))))
+            if database.exists_matches(ids[pair[0]], ids[pair[1]]):
+                raise InputError(f"the pair {pair} has matches in both directions; give them in one")
+            database.write_matches(ids[pair[0]], ids[pair[1]], np.ascontiguousarray(indices, np.uint32))
+
+
+@contextmanager
+def changing_copy(source: Path, target: Path) -> Iterator[pycolmap.Database]:
+    """A copy of a database to change; it takes the place of `target` (which may be the source) when all went well."""
+    with _replacing(target) as partial:
+        _copy(source, partial)
         with pycolmap.Database.open(partial) as database:
-            database.clear_two_view_geometries()
-            database.clear_matches()
-            database.clear_descriptors()
-            database.clear_keypoints()
-            ids = {image.name: image.image_id for image in database.read_all_images()}
-            unknown = ({*keypoints} | {name for pair in matches for name in pair}) - {*ids}
-            if unknown:
-                raise InputError(f"image '{min(unknown)}' is not in {imported}; import its camera first")
-            for name, image_id in sorted(ids.items(), key=lambda item: item[1]):
-                points = keypoints.get(name, np.zeros((0, 2), np.float32))
-                _check_keypoints(name, points)
-                database.write_keypoints(image_id, np.ascontiguousarray(points, np.float32))
-            for pair, indices in sorted(matches.items(), key=lambda item: sorted(ids[name] for name in item[0])):
-                _check_matches(pair, indices, (len(keypoints.get(pair[0], ())), len(keypoints.get(pair[1], ()))))
-                if database.exists_matches(ids[pair[0]], ids[pair[1]]):
-                    raise InputError(f"the pair {pair} has matches in both directions; give them in one")
-                database.write_matches(ids[pair[0]], ids[pair[1]], np.ascontiguousarray(indices, np.uint32))
+            yield database
 
 
 def _parameters(model: str, params: str | Sequence[float | str] | None) -> tuple[float, ...] | None:
@@ -281,16 +331,42 @@ def _listed_cameras(path: Path) -> dict[str, KnownCamera]:
     return cameras
 
 
+def _numbered_cameras(path: Path, cameras: Mapping[str, KnownCamera]) -> dict[str, KnownCamera]:
+    """The cameras of COLMAP's cameras.txt by image name."""
+    if len(cameras) == 1:
+        return {"*": next(iter(cameras.values()))}
+    images = path.with_name("images.txt")
+    if not images.is_file():
+        raise InputError(
+            f"{path} has {len(cameras)} cameras, and no images.txt beside it says which image has which; put it there, "
+            "or write lines `name MODEL width height params...` with names, `folder/*` or `*`"
+        )
+    named = {}
+    lines = [line for line in images.read_text(encoding="utf-8-sig").splitlines() if not line.startswith("#")]
+    for line in filter(str.strip, lines[::2]):  # a line of points, which may be empty, follows each
+        fields = line.split(maxsplit=9)
+        if len(fields) != 10 or fields[8] not in cameras:
+            raise InputError(
+                f"{images}: '{line}' names no camera of {path}; expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            )
+        named[fields[9].strip()] = cameras[fields[8]]
+    return named
+
+
 def _import_groups(
-    names: Sequence[str], known: Mapping[str, KnownCamera], options: CameraOptions
+    names: Sequence[str], known: Mapping[str, KnownCamera], options: CameraOptions, rigs: Rigs | None
 ) -> Iterator[tuple[list[str], pycolmap.CameraMode, str, Sequence[float] | None]]:
     """Images that are imported together: names, camera mode, model and parameters."""
     single = pycolmap.CameraMode.SINGLE
-    by_camera: dict[KnownCamera, list[str]] = {}
+    by_camera: dict[tuple[KnownCamera, str], list[str]] = {}
     by_folder: dict[str, list[str]] = {}
+    by_prefix: dict[str, list[str]] = {}
     for name in sorted(names):
+        prefix = rigs.prefix_of(name) if rigs else ""  # its images share a camera, even if another has equal parameters
         if name in known:
-            by_camera.setdefault(known[name], []).append(name)
+            by_camera.setdefault((known[name], prefix), []).append(name)
+        elif prefix:
+            by_prefix.setdefault(prefix, []).append(name)
         else:
             # COLMAP's own per-folder mode gives images that sort after a subfolder that subfolder's camera.
             folder = str(PurePosixPath(name).parent) if options.mode == "per-folder" else ""
@@ -303,14 +379,28 @@ def _import_groups(
     }[options.mode]
     for group in by_folder.values():
         yield group, mode, options.model, options.params  # type: ignore[misc]
-    for camera, group in by_camera.items():
+    for group in by_prefix.values():
+        yield group, single, options.model, options.params  # type: ignore[misc]
+    for (camera, _), group in by_camera.items():
         yield group, single, camera.model, camera.params
 
 
-def _read_cameras_of_images(path: Path, known: Collection[str]) -> dict[str, CameraInfo]:
+def _refuse_another(name: str, info: CameraInfo, listed: KnownCamera | None, options: CameraOptions) -> None:
+    """A camera that was given for an image must be the one that the existing database has for it."""
+    given = (listed.model, listed.params) if listed else (options.model, options.params)
+    if given[1] is not None and given != (info.model, info.params):
+        raise InputError(
+            f"the camera of '{name}' is {info.model} {','.join(map(str, info.params))} in {options.database}, but "
+            f"{given[0]} {','.join(map(str, given[1]))} was given; leave out --cameras or --camera-params for images "
+            "that the database has"
+        )
+
+
+def _read_cameras_of_images(path: Path, names: Collection[str], known: Collection[str]) -> dict[str, CameraInfo]:
     with pycolmap.Database.open(path) as database:
         cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
         images = sorted(database.read_all_images(), key=lambda image: image.name)
+    names = frozenset(names)
     return {
         image.name: CameraInfo(
             image_id=image.image_id,
@@ -323,6 +413,7 @@ def _read_cameras_of_images(path: Path, known: Collection[str]) -> dict[str, Cam
             known=image.name in known,
         )
         for image in images
+        if image.name in names
     }
 
 
@@ -342,7 +433,8 @@ def _failures(image_folder: Path, names: Sequence[str]) -> tuple[dict[str, str],
     return reasons, sizes
 
 
-def _check_keypoints(name: str, points: np.ndarray) -> None:
+def check_keypoints(name: str, points: np.ndarray) -> None:
+    """Raises: ShapeError for anything but finite pixels (N, 2)."""
     # COLMAP accepts more columns than it documents and ends the process when it verifies them.
     if points.ndim != 2 or points.shape[1] != 2 or points.dtype.kind != "f":
         raise ShapeError(f"keypoints of '{name}' are {points.dtype} {points.shape}; expected float32 (N, 2)")
@@ -350,7 +442,8 @@ def _check_keypoints(name: str, points: np.ndarray) -> None:
         raise ShapeError(f"keypoints of '{name}' contain values that are not finite")
 
 
-def _check_matches(pair: Pair, indices: np.ndarray, counts: tuple[int, int]) -> None:
+def check_matches(pair: Pair, indices: np.ndarray, counts: tuple[int, int]) -> None:
+    """Raises: ShapeError for anything but one-to-one matches (M, 2) of so many keypoints."""
     # COLMAP checks none of this: out-of-range indices read foreign memory, repeated ones bend the geometry.
     if indices.ndim != 2 or indices.shape[1] != 2 or indices.dtype.kind not in "iu":
         raise ShapeError(f"matches of {pair} are {indices.dtype} {indices.shape}; expected uint32 (M, 2)")
@@ -363,6 +456,15 @@ def _check_matches(pair: Pair, indices: np.ndarray, counts: tuple[int, int]) -> 
             )
         if len(np.unique(column)) != len(column):
             raise ShapeError(f"matches of {pair} use a keypoint of '{pair[side]}' more than once; expected one-to-one")
+
+
+def copy_database(source: Path, target: Path) -> None:
+    """Copy a database with what is still in its journal; an older `target` is replaced once the copy is whole.
+
+    Raises: InputError when there is none; StageError when it cannot be read.
+    """
+    with _replacing(target) as partial:
+        _copy(source, partial)
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sgam_core.errors import InputError, OptionError
+from sgam_sfm.appending import require_no_descriptors
 from sgam_sfm.database import CameraInfo, CameraOptions, import_cameras
 from sgam_sfm.images import ImageFile, image_format, inspect_image, list_images, printable
 from sgam_sfm.options import MatchOptions
@@ -61,12 +62,18 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
                 params=options.camera_params or None,
                 mode=options.camera_mode,
                 cameras=options.cameras,
+                rigs=options.rigs,
+                database=options.database,
             ),
         )
     for name, reason in imported.failures.items():
         failed[name] = f"'{name}' ({image_format(images[name].path)}): {reason}"
         del images[name]
         _log.warning("%s", failed[name])
+    if options.database is not None:
+        _check_existing(options.database, images, imported.cameras)
+        if not options.append:
+            require_no_descriptors(options.database, options.output / "cameras.db", images)
     same = same_content(images.values())
     if same:
         _log.warning("%d images have the same content as another, such as '%s' and '%s'", len(same), *same[:2])
@@ -118,6 +125,16 @@ def read_images(folder: Path, output: Path, stages: Stages) -> FoundImages:
                 _log.warning("%s", error)
             advance(1)
     return FoundImages(images=images, failed=failed, num_other_files=num_other_files)
+
+
+def _check_existing(database: Path, images: Mapping[str, ImageFile], cameras: Mapping[str, CameraInfo]) -> None:
+    for name, file in images.items():
+        camera = cameras[name]
+        if (camera.width, camera.height) != (file.width, file.height):
+            raise InputError(
+                f"'{name}' is {camera.width}x{camera.height} in --database '{database}' but {file.width}x{file.height} "
+                "(width x height) in the image folder; give the images that the database was made from"
+            )
 
 
 def _check_any(images: Mapping[str, ImageFile], failed: Mapping[str, str], folder: Path) -> None:

@@ -30,11 +30,12 @@ from typing import Any
 from sgam_core.errors import InputError, OptionError, StageError
 from sgam_sfm.machine import peak_memory_mb
 from sgam_sfm.pairs import Pair
+from sgam_sfm.triangulation import require_fitting, triangulated
 
 Progress = Callable[[str, int, int], None]
 """Called with the name of the step, how much of it is done, and how much there is (0 when nobody knows)."""
 
-MAPPERS = ("incremental", "global")
+MAPPERS = ("incremental", "global", "hierarchical", "triangulate")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -70,7 +71,8 @@ class VerificationSummary:
 class MappingOptions:
     """COLMAP's mappers; what is not named here keeps COLMAP's default.
 
-    mapper: incremental, or global (GLOMAP). refine_intrinsics: let bundle adjustment change cameras that the user gave;
+    mapper: incremental; global (GLOMAP); hierarchical (clusters of many images, mapped apart and joined); triangulate
+    (points only, for poses that are known). refine_intrinsics: let bundle adjustment change cameras that the user gave;
     other cameras are always refined, as COLMAP does. min_model_size: images, smaller models are dropped. threads: the
     incremental mapper gives the same model every time with 1 only; -1 for all cores.
     """
@@ -134,14 +136,22 @@ def verify(
     options: VerificationOptions | None = None,
     on_progress: Progress | None = None,
     log_path: Path | None = None,
+    *,
+    anew: bool = True,
 ) -> VerificationSummary:
-    """Estimate the two-view geometry of every pair with matches, anew, and write it into the database.
+    """Estimate the two-view geometry of every pair with matches and write it into the database.
 
-    Args: log_path: takes COLMAP's own log, by default `colmap.log` beside the database.
+    Args: anew: of pairs too that have one. log_path: takes COLMAP's own log, by default `colmap.log` beside the
+        database.
     Raises: StageError when COLMAP fails or ends its process; InputError when there is no database.
     """
     _require(database_path)
-    job = {"stage": "verification", "database": str(database_path), "options": asdict(options or VerificationOptions())}
+    job = {
+        "stage": "verification",
+        "database": str(database_path),
+        "options": asdict(options or VerificationOptions()),
+        "anew": anew,
+    }
     result, seconds = _run(job, log_path or database_path.parent / "colmap.log", on_progress)
     return VerificationSummary(
         inliers={(name0, name1): count for name0, name1, count in result["inliers"]},
@@ -189,30 +199,41 @@ def map_images(
     on_progress: Progress | None = None,
     *,
     known_camera_ids: Collection[int] = (),
+    input_model: Path | None = None,
     log_path: Path | None = None,
 ) -> MappingSummary:
     """Build models from a verified database: output_sparse/0 is the one with most images, then 1, 2, ...
 
     Models of an earlier run in `output_sparse` are replaced once the new ones are complete.
 
-    Args: known_camera_ids: cameras that the user gave, held fixed unless the options refine them. log_path: takes
-        COLMAP's own log, by default `colmap.log` beside the database.
-    Raises: StageError when COLMAP fails or ends its process; InputError when the database or image folder is missing;
-        OptionError when the global mapper would have to hold some cameras fixed and not others.
+    Args: known_camera_ids: cameras that the user gave, held fixed unless the options refine them. input_model: folder
+        with the COLMAP model whose poses and cameras `triangulate` holds. log_path: takes COLMAP's own log, by default
+        `colmap.log` beside the database.
+    Raises: StageError when COLMAP fails or ends its process; InputError when the database or image folder is missing,
+        or the input model does not fit the database; OptionError when there is no input model to triangulate, or
+        when the global mapper would have to hold some cameras fixed and not others.
     """
     options = options or MappingOptions()
     _require(database_path)
     if not image_folder.is_dir():
         raise InputError(f"there is no image folder at {image_folder}")
     partial = output_sparse.with_name(f".{output_sparse.name}.{os.getpid()}.partial")
-    job = {
-        "stage": f"{options.mapper} mapping",
+    job: dict[str, Any] = {
+        "stage": "triangulation" if options.mapper == "triangulate" else f"{options.mapper} mapping",
         "database": str(database_path),
         "images": str(image_folder),
         "output": str(partial),
         "options": asdict(options),
         "fixed_cameras": [] if options.refine_intrinsics else sorted(known_camera_ids),
     }
+    if (options.mapper == "triangulate") != (input_model is not None):
+        raise OptionError(
+            "the mapper triangulate and an input model go together: --mapper triangulate --input-model DIR, with a "
+            "COLMAP model of known poses"
+        )
+    if input_model is not None:
+        require_fitting(input_model, database_path)
+        job["input_model"] = str(input_model)
     if options.mapper == "global" and job["fixed_cameras"]:
         _refuse_partly_known(database_path, len(job["fixed_cameras"]))
     try:
@@ -331,7 +352,8 @@ def _verify(job: dict[str, Any], send: Send) -> dict[str, Any]:
 
     options = VerificationOptions(**job["options"])
     with pycolmap.Database.open(job["database"]) as database:
-        database.clear_two_view_geometries()  # COLMAP skips pairs that have one
+        if job["anew"]:
+            database.clear_two_view_geometries()  # COLMAP skips pairs that have one
         names = {image.image_id: image.name for image in database.read_all_images()}
         num_pairs = database.num_matched_image_pairs()
     verifier = pycolmap.GeometricVerifierOptions()
@@ -388,6 +410,10 @@ def _map(job: dict[str, Any], send: Send) -> dict[str, Any]:
     fixed = {*job["fixed_cameras"]}
     if options.mapper == "incremental":
         models = _map_incrementally(job, options, fixed, total, send)
+    elif options.mapper == "hierarchical":
+        models = _map_hierarchically(job, options, fixed)
+    elif options.mapper == "triangulate":
+        models = [triangulated(job, options, send)]
     else:
         calibrated = all(camera.has_prior_focal_length for camera in cameras)
         models = _map_globally(job, options, bool(fixed), calibrated, send)
@@ -398,6 +424,8 @@ def _map(job: dict[str, Any], send: Send) -> dict[str, Any]:
         f"best with {max(verified, default=0)} inliers; try pairs that overlap more (`sgam-sfm show OUT` draws them), "
         "a larger --image-size, or another --matcher"
     )
+    if options.mapper == "triangulate" and not models[0].num_points3D():
+        models, reason = [], f"COLMAP triangulated no point with the known poses from {len(verified)} verified pairs"
     order = sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     summaries = []
     for number, model in enumerate(order):
@@ -411,11 +439,6 @@ def _map(job: dict[str, Any], send: Send) -> dict[str, Any]:
 def _map_incrementally(job: dict[str, Any], options: MappingOptions, fixed: set[int], total: int, send: Send) -> list:
     import pycolmap
 
-    pipeline = pycolmap.IncrementalPipelineOptions()
-    pipeline.min_model_size = options.min_model_size
-    pipeline.random_seed = options.seed
-    pipeline.num_threads = options.threads
-    pipeline.constant_cameras = fixed
     registered = 0
 
     def started() -> None:
@@ -432,11 +455,31 @@ def _map_incrementally(job: dict[str, Any], options: MappingOptions, fixed: set[
         job["database"],
         job["images"],
         job["output"],
-        pipeline,
+        _incremental_options(options, fixed),
         initial_image_pair_callback=started,
         next_image_callback=added,
     )
     return list(models.values())
+
+
+def _map_hierarchically(job: dict[str, Any], options: MappingOptions, fixed: set[int]) -> list:
+    import pycolmap
+
+    pipeline = pycolmap.HierarchicalPipelineOptions()
+    pipeline.incremental_options = _incremental_options(options, fixed)
+    pipeline.num_threads = pipeline.num_workers = options.threads
+    return list(pycolmap.hierarchical_mapping(job["database"], job["images"], job["output"], pipeline).values())
+
+
+def _incremental_options(options: MappingOptions, fixed: set[int]) -> Any:
+    import pycolmap
+
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    pipeline.min_model_size = options.min_model_size
+    pipeline.random_seed = options.seed
+    pipeline.num_threads = options.threads
+    pipeline.constant_cameras = fixed
+    return pipeline
 
 
 def _map_globally(job: dict[str, Any], options: MappingOptions, all_fixed: bool, calibrated: bool, send: Send) -> list:

@@ -90,11 +90,19 @@ class MatchOptions:
     camera_mode: Literal["auto", "single", "per-folder", "per-image"] = "auto"
     """Which images share a camera."""
     cameras: Path | None = None
-    """Parameters for each image: a COLMAP model, or lines `name MODEL width height params...` (`*`: all images)."""
+    """Parameters for each image: a COLMAP model or cameras.txt, or lines `name MODEL width height params...` (`*`: all
+    images, `folder/*`: those of a folder)."""
+    rigs: Path | None = None
+    """COLMAP's rig configuration (JSON): cameras that are mounted together."""
     refine_intrinsics: bool = False
     """Let mapping refine parameters that were given explicitly."""
-    mapper: Literal["incremental", "global"] = "incremental"
-    """COLMAP's incremental mapper, or its global one (GLOMAP)."""
+    mapper: Literal["incremental", "global", "hierarchical"] = "incremental"
+    """COLMAP's incremental mapper; its global one (GLOMAP); the hierarchical one, for thousands of images."""
+    database: Path | None = None
+    """COLMAP database to write into, changed only once all pairs are verified: keypoints and matches are appended to
+    those it has, other pairs stay as they are. Images that it does not have are added."""
+    append: bool = False
+    """Append keypoints also to images that have descriptors in --database, which then cover the first ones only."""
     mapping: bool = True
     """Make a model; --no-mapping stops after the geometric verification."""
 
@@ -178,8 +186,8 @@ class SegmentOptions:
 
 
 NOT_IN_RESULTS = frozenset(
-    {"images", "pairs", "cameras", "output", "config", "threads", "verbose", "accept_licence"}
-    | {"refine_intrinsics", "mapper", "mapping", "keypoints"}
+    {"images", "pairs", "cameras", "rigs", "output", "config", "threads", "verbose", "accept_licence"}
+    | {"refine_intrinsics", "mapper", "mapping", "keypoints", "database", "append"}
 )
 """Options that the raw results of pairs do not follow from: a run can be continued with others. The images, pairs and
 cameras themselves count, wherever they are."""

@@ -127,6 +127,13 @@ class Results:
         """The names of labels that have one."""
         return {label.id: label.name for label in read_label_set(self.folder / "labels").labels if label.name}
 
+    def database(self) -> Path:
+        """The run's database. Raises: InputError when there is none yet."""
+        path = self.folder / "database.db"
+        if not path.is_file():
+            raise InputError(f"'{self.folder}' has no database.db yet; start the same match again, it writes one")
+        return path
+
     def inliers(self, pair: Pair) -> MatchedPoints | None:
         """The matches that COLMAP's verification left of a pair, None when it has not verified the pair."""
         database = self.folder / "database.db"
@@ -174,7 +181,7 @@ def open_results(folder: Path, images: Path | None = None) -> Results:
     """
     if not folder.is_dir():
         raise InputError(f"'{folder}' {'is a file' if folder.exists() else 'does not exist'}; {_EXPECTED}")
-    options = _json(folder / "options.json")
+    options = json_object(folder / "options.json")
     if "images" not in options:
         inner = [path.parent for path in sorted(folder.glob("*/options.json"))]
         hint = f"did you mean '{inner[0]}'?" if inner else _EXPECTED
@@ -185,7 +192,7 @@ def open_results(folder: Path, images: Path | None = None) -> Results:
             f"the image folder '{image_folder}' does not exist"
             + ("; check --images" if images else ": if it was moved, give the new one with --images DIR")
         )
-    inputs, summary = _json(folder / "inputs.json"), _json(folder / "summary.json")
+    inputs, summary = json_object(folder / "inputs.json"), json_object(folder / "summary.json")
     failed = {**summary.get("images", {}).get("failed", {}), **inputs.get("failed", {})}
     stored = tuple(read_pair_outcomes(folder))
     blocks = {outcome.pair: outcome.block for outcome in stored}
@@ -229,7 +236,7 @@ def find_plain(results: Results, pair: Pair) -> Results | None:
         return None
     candidates = []
     for path in sorted(results.folder.resolve().parent.glob("*/options.json")):
-        options = _json(path)
+        options = json_object(path)
         same = options.get("area_matcher") == "none" and options.get("matcher") == results.options.get("matcher")
         if same and Path(options.get("images", "")).resolve() == Path(results.options["images"]).resolve():
             others = sum(options.get(name) != value for name, value in results.options.items())
@@ -264,7 +271,7 @@ def _swapped_area(area: AreaMatch) -> AreaMatch:
     return replace(area, area0=area.area1, area1=area.area0, scale0=area.scale1, scale1=area.scale0)
 
 
-def _json(path: Path) -> dict[str, Any]:
+def json_object(path: Path) -> dict[str, Any]:
     """The content of a JSON file; empty when it is missing or no object: such a run has just not got so far."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

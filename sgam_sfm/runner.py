@@ -3,39 +3,31 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from sgam_core import Matches, PointMatcher
+from sgam_core import PointMatcher
 from sgam_core.errors import OptionError
-from sgam_core.geometry import residuals
+from sgam_sfm.appending import Stamp, append_to_database, replace_database, stamp_of
+from sgam_sfm.assembly import build_models, merge_records, verify_pairs
 from sgam_sfm.database import write_database
 from sgam_sfm.files import write_json
-from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
 from sgam_sfm.inputs import Inputs, read_inputs
-from sgam_sfm.keypoints import merge_keypoints
 from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import find_device, peak_memory_mb, use_threads
-from sgam_sfm.mapping import (
-    MappingOptions,
-    MappingSummary,
-    VerificationOptions,
-    VerificationSummary,
-    map_images,
-    verify,
-)
+from sgam_sfm.mapping import MappingOptions, MappingSummary, VerificationOptions, VerificationSummary
 from sgam_sfm.matching import CollectionMatcher, create_area_matcher, create_matcher, match_blocks
 from sgam_sfm.options import NOT_IN_RESULTS, VERSION, MatchOptions, as_json, fingerprint
-from sgam_sfm.pairs import Pair, blocks
-from sgam_sfm.progress import Advance, Stages
+from sgam_sfm.pairs import blocks
+from sgam_sfm.progress import Stages
 from sgam_sfm.run_record import recording
-from sgam_sfm.store import PairRecord, PairStore
+from sgam_sfm.store import PairStore
 from sgam_sfm.summary import summarise_images, summarise_keypoints, summarise_pairs, versions
+
+KNOWN_CAMERAS = "known_cameras"
+"""In inputs.json: the images whose camera the user gave."""
 
 
 def match_collection(
@@ -59,6 +51,7 @@ def _match_collection(options: MatchOptions, stages: Stages, point_matcher: Poin
     needs_labels = create_area_matcher(options).needs_labels or bool(options.mask_matches)
     output = options.output
 
+    existing = None if options.database is None else _stamp(options.database, output)
     inputs = read_inputs(options, stages)
     store = open_store(options, inputs)
     labels = make_label_maps(options, inputs.images, stages) if needs_labels else None
@@ -68,13 +61,10 @@ def _match_collection(options: MatchOptions, stages: Stages, point_matcher: Poin
 
     with stages.stage("Merging keypoints", None):
         records = list(store.read_all(len(work)))
-        matches, inliers = stored_matches(records, options)
-        merged = merge_keypoints(matches, options.keypoints, inliers)
-        write_keypoints_h5(output / "keypoints.h5", merged.keypoints)
-        counts = {name: len(points) for name, points in merged.keypoints.items()}
-        write_matches_h5(output / "matches.h5", merged.matches, merged.scores, counts)
-        write_database(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
-    verified, mapped = reconstruct(options, inputs, stages)
+        merged = merge_records(records, options.keypoints, options.geometry.max_residual, output)
+        write = write_database if existing is None else append_to_database
+        write(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
+    verified, mapped = reconstruct(options, inputs, stages, existing)
 
     summary = {
         "images": summarise_images(inputs),
@@ -114,7 +104,8 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
                 )
             (options.output / "labels" / RECORD).unlink(missing_ok=True)  # nothing is matched yet: begin anew
     write_json(path, now)
-    known = {"images": inputs.digests, "failed": inputs.failed}
+    given = sorted(name for name, camera in inputs.cameras.items() if camera.known)
+    known = {"images": inputs.digests, "failed": inputs.failed, KNOWN_CAMERAS: given}
     listed = {"pairs": inputs.pairs.pairs, "left_out": inputs.pairs.unreadable}
     write_json(options.output / "inputs.json", known | listed)
     return PairStore(folder=options.output / "pairs", fingerprint=mark)
@@ -148,49 +139,35 @@ def _flags(options: dict[str, Any], prefix: str = "--") -> dict[str, Any]:
     return flat
 
 
-def stored_matches(
-    records: Sequence[PairRecord], options: MatchOptions
-) -> tuple[dict[Pair, Matches], dict[Pair, np.ndarray]]:
-    """The point matches of every pair that has any, and (M,) which of them agree with the pair's geometry."""
-    matches, inliers = {}, {}
-    for record in records:
-        if record.result is not None and len(record.result.matches):
-            matches[record.pair] = record.result.matches
-            model = record.result.two_view
-            if model is not None:
-                inliers[record.pair] = residuals(model.F, record.result.matches) <= options.geometry.max_residual
-    return matches, inliers
+def _stamp(database: Path, output: Path) -> Stamp:
+    if database.resolve() == (output / "database.db").resolve():
+        raise OptionError(f"--database '{database}' is what the run writes itself; leave it out, or choose another one")
+    return stamp_of(database)
 
 
 def reconstruct(
-    options: MatchOptions, inputs: Inputs, stages: Stages
+    options: MatchOptions, inputs: Inputs, stages: Stages, existing: Stamp | None = None
 ) -> tuple[VerificationSummary, MappingSummary | None]:
-    """COLMAP's verification, then its mapper unless --no-mapping."""
+    """COLMAP's verification, then its mapper unless --no-mapping.
+
+    Args: existing: stamp of the --database that OUT/database.db was made from, which it replaces once it is verified.
+    """
     database = options.output / "database.db"
-    with stages.stage("Verifying pairs", len(inputs.pairs.pairs)) as advance:
-        verification = VerificationOptions(seed=options.seed, threads=options.threads or -1)
-        verified = verify(database, verification, _relative(advance))
+    verification = VerificationOptions(seed=options.seed, threads=options.threads or -1)
+    verified = verify_pairs(database, verification, stages, anew=existing is None)
+    if options.database is not None and existing is not None:
+        replace_database(options.database, database, existing)
+        ours = {frozenset(pair) for pair in inputs.pairs.pairs}
+        inliers = {pair: count for pair, count in verified.inliers.items() if frozenset(pair) in ours}
+        verified = replace(verified, inliers=inliers)
     if not options.mapping:
         return verified, None
-    with stages.stage("Mapping", len(inputs.images)) as advance:
-        mapped = map_images(
-            database,
-            options.images,
-            options.output / "sparse",
-            MappingOptions(mapper=options.mapper, refine_intrinsics=options.refine_intrinsics, seed=options.seed),
-            _relative(advance),
-            known_camera_ids={camera.camera_id for camera in inputs.cameras.values() if camera.known},
-        )
+    mapped = build_models(
+        database,
+        options.images,
+        options.output / "sparse",
+        MappingOptions(mapper=options.mapper, refine_intrinsics=options.refine_intrinsics, seed=options.seed),
+        stages,
+        known_camera_ids={camera.camera_id for camera in inputs.cameras.values() if camera.known},
+    )
     return verified, mapped
-
-
-def _relative(advance: Advance) -> Callable[[str, int, int], None]:
-    """COLMAP's stages tell how far they are, a progress bar wants to know what is new."""
-    shown = 0
-
-    def progress(step: str, done: int, total: int) -> None:
-        nonlocal shown
-        advance(done - shown)
-        shown = done
-
-    return progress

@@ -94,7 +94,7 @@ def versions() -> dict[str, str]:
 
 def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     """A table for the terminal."""
-    images, pairs, models = summary["images"], summary["pairs"], summary["models"]
+    images, pairs = summary["images"], summary["pairs"]
     table = Table(show_header=False, box=None)
     table.add_row("images", f"{images['used']} used, {len(images['failed'])} failed")
     dropped = sum(pairs[reason] for reason in ("repeated", "reversed", "self"))
@@ -123,13 +123,28 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     if pairs["pairs_with_limits"]:
         table.add_row("limits", f"reached in {pairs['pairs_with_limits']} pairs (`sgam-sfm show` tells which)")
     table.add_row("matches", f"{pairs['raw_matches']} raw, {summary['keypoints']['matches']} as tracks")
-    for number, model in enumerate(models):
+    _add_models(summary, table)
+    console.print(table)
+
+
+def print_models(content: Mapping[str, Any], console: Console) -> None:
+    """A table for the terminal of what `reconstruct` or `aggregate` made."""
+    table = Table(show_header=False, box=None)
+    table.add_row("pairs", f"{content['pairs']} with matches, {content['verified']} verified")
+    if "keypoints" in content:
+        merged = content["keypoints"]
+        table.add_row("matches", f"{merged['raw_matches']} raw, {merged['matches']} as tracks")
+    _add_models(content, table)
+    console.print(table)
+
+
+def _add_models(content: Mapping[str, Any], table: Table) -> None:
+    for number, model in enumerate(content["models"]):
         table.add_row(
             f"model {number}",
             f"{model['registered']} of {model['total']} images, {model['points']} points, "
             f"{model['mean_images_per_track']:.2f} images a track, {model['mean_reprojection_error_px']:.3f} px",
         )
-    if not models:
-        table.add_row("model", summary["no_model"])
-    table.add_row("time", ", ".join(f"{name.lower()} {value:.0f} s" for name, value in summary["seconds"].items()))
-    console.print(table)
+    if not content["models"]:
+        table.add_row("model", content["no_model"])
+    table.add_row("time", ", ".join(f"{name.lower()} {value:.0f} s" for name, value in content["seconds"].items()))

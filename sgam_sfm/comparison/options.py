@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from sgam_core.errors import OptionError
 from sgam_sfm.options import MatchOptions
 
 
@@ -34,3 +35,7 @@ class CompareOptions(MatchOptions):
     """Write OUT/report.html."""
     max_image_size: int = 4096
     """The longest side of a whole image that memory allows a method with a budget."""
+
+    def __post_init__(self) -> None:
+        if self.database is not None or self.append:
+            raise OptionError("--database and --append are for `sgam-sfm match`; compare makes its own")

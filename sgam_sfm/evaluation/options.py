@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+from sgam_core.errors import OptionError
 from sgam_sfm.options import MatchOptions
 
 
@@ -30,6 +31,10 @@ class EvaluateOptions(MatchOptions):
     """Judge only this many pairs, evenly over the list (0: all)."""
     auc_degrees: tuple[float, ...] = (1.0, 5.0, 10.0, 20.0)
     """Angles of the pose AUC (the paper: 5, 10, 20)."""
+
+    def __post_init__(self) -> None:
+        if self.database is not None or self.append:
+            raise OptionError("--database and --append are for `sgam-sfm match`; evaluate writes to no database")
 
     @property
     def matching(self) -> MatchOptions:

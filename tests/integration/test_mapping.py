@@ -249,7 +249,7 @@ def test_missing_inputs_are_not_created(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["database.db"]
 
 
-@pytest.mark.parametrize("bad", [{"mapper": "hierarchical"}, {"min_model_size": 1}])
+@pytest.mark.parametrize("bad", [{"mapper": "spherical"}, {"min_model_size": 1}])
 def test_mapping_options_are_checked(bad):
     with pytest.raises(OptionError):
         MappingOptions(**bad)

@@ -23,7 +23,10 @@ def written(tmp_path: Path, content: object, name: str = "c.json") -> Path:
         ({"zzz": 1}, "option 'zzz' is unknown"),
         ({"seed": "many"}, "option 'seed' is 'many': Input should be a valid integer, unable to parse string as an"),
         ({"mapping": [1]}, "option 'mapping' is [1]: Input should be a valid boolean"),
-        ({"mapper": "colmap"}, "option 'mapper' is 'colmap': Input should be 'incremental' or 'global'"),
+        (
+            {"mapper": "colmap"},
+            "option 'mapper' is 'colmap': Input should be 'incremental', 'global' or 'hierarchical'",
+        ),
         ({"preset": "papr"}, "preset 'papr' is unknown; known: default, paper"),
         ([1, 2], "holds a list; expected options by name"),
         ("{", "cannot be used ("),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,24 @@ from scipy.spatial.transform import Rotation
 from sgam_core.errors import InputError
 from sgam_sfm.evaluation.ground_truth.reading import camera_matrix, floats, rigid, text_lines
 from sgam_sfm.evaluation.ground_truth.types import Format, GroundTruth, TrueView
+from sgam_sfm.files import replacing
 
 HEADER = "name,width,height,fx,fy,cx,cy,qw,qx,qy,qz,tx,ty,tz"
+
+
+def write_camera_table(path: Path, views: Iterable[TrueView]) -> None:
+    """Write views with a pose so that they are read back."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(HEADER.split(","))
+    for view in views:
+        assert view.cam_from_world is not None
+        x, y, z, w = Rotation.from_matrix(view.cam_from_world[:, :3]).as_quat()
+        K, t = view.camera_matrix, view.cam_from_world[:, 3]
+        numbers = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], w, x, y, z, *t)
+        rows.writerow([view.name, view.width, view.height, *(f"{value:.17g}" for value in numbers)])
+    with replacing(path) as partial:
+        partial.write_text(text.getvalue(), encoding="utf-8")
 
 
 def _read(path: Path, images: Path | None) -> GroundTruth:

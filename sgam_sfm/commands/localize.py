@@ -1,0 +1,38 @@
+"""`sgam-sfm localize`: poses of new photos in a model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+
+from sgam_sfm.exit_codes import DONE, NO_MODEL, SOME_FAILED
+from sgam_sfm.logs import logging_to
+from sgam_sfm.stage_options import LocalizeOptions
+
+_MAX_REASONS = 10
+
+
+def run(options: LocalizeOptions, console: Console) -> int:
+    """Localize; say what has no pose and why."""
+    from sgam_sfm.inputs import refuse_among_images
+    from sgam_sfm.localization import localize
+    from sgam_sfm.progress import Stages
+
+    refuse_among_images(options.output, options.images)  # before the log is begun there
+    with logging_to(options.output / "log.txt", console, verbose=options.verbose):
+        content = localize(options, Stages(console=console))
+    _print(content, console)
+    if not content["localized"]:
+        return NO_MODEL
+    return SOME_FAILED if content["failed"] else DONE
+
+
+def _print(content: dict[str, Any], console: Console) -> None:
+    total = content["localized"] + len(content["failed"])
+    lines = [("poses", f"{content['localized']} of {total} photos, with {content['references']} references")]
+    lines += [("failed", f"{name}: {reason}") for name, reason in list(content["failed"].items())[:_MAX_REASONS]]
+    if len(content["failed"]) > _MAX_REASONS:
+        lines.append(("", f"and {len(content['failed']) - _MAX_REASONS} more, in localize.json"))
+    for what, text in lines:
+        console.print(f"{what:<10} {text}", highlight=False, markup=False, soft_wrap=True)
