@@ -25,6 +25,8 @@ from sgam_sfm.scene import correspond
 from tests.room import Room, TrueMatcher
 
 Results = dict[tuple[str, str], PairResult]
+ONE_ROUND = changed(SGAMOptions(), guidance__enabled=False)
+"""The paper's algorithm alone."""
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +47,7 @@ def match_all(room: Room, point_matcher: TrueMatcher, options: SGAMOptions) -> R
 
 @pytest.fixture(scope="module")
 def results(room: Room, point_matcher: TrueMatcher) -> Results:
-    return match_all(room, point_matcher, SGAMOptions())
+    return match_all(room, point_matcher, ONE_ROUND)
 
 
 def overlaps(room: Room, results: Results, state: str, predicted: bool | None = None) -> np.ndarray:
@@ -103,9 +105,9 @@ def test_matches_of_overlapping_pairs_are_true(room, results):
 
 
 def test_gmc_adds_true_matches_where_areas_cover_little(room, point_matcher):
-    everywhere = match_all(room, point_matcher, SGAMOptions())
-    little = match_all(room, point_matcher, changed(SGAMOptions(), collection__min_coverage=0.3))
-    never = match_all(room, point_matcher, changed(SGAMOptions(), collection__rule="none"))
+    everywhere = match_all(room, point_matcher, ONE_ROUND)
+    little = match_all(room, point_matcher, changed(ONE_ROUND, collection__min_coverage=0.3))
+    never = match_all(room, point_matcher, changed(ONE_ROUND, collection__rule="none"))
     distances = [errors(room, pair, r)[r.matches.area_index < 0] for pair, r in everywhere.items() if not r.fallback]
     gained = np.concatenate(distances)
     assert len(gained) > 500
@@ -114,6 +116,20 @@ def test_gmc_adds_true_matches_where_areas_cover_little(room, point_matcher):
         assert result.fallback or (result.matches.area_index >= 0).all()
         assert len(result.matches) <= len(little[pair].matches)
     assert sum(len(r.matches) for r in little.values()) < sum(len(r.matches) for r in everywhere.values())
+
+
+def test_guided_areas_show_the_same_part_of_the_room_more_finely(room, point_matcher):
+    coarse = changed(SGAMOptions(), crop__image_size=256, crop__area_size=320)
+    guided = match_all(room, point_matcher, coarse)
+    first = match_all(room, point_matcher, changed(coarse, guidance__enabled=False))
+    used = [pair for pair, result in guided.items() if any(area.area0.kind == "guided" for area in result.areas)]
+    assert len(used) >= 8
+    found = {pair: guided[pair] for pair in used}
+    assert np.median(overlaps(room, found, "kept")) > 0.55
+    finer, before = (
+        np.median(np.concatenate([errors(room, pair, results[pair]) for pair in used])) for results in (guided, first)
+    )
+    assert finer < 0.8 * before
 
 
 @pytest.mark.parametrize(("matcher", "fewest"), [(TileAreaMatcher(), 50), (CovisibleAreaMatcher(), 9)])

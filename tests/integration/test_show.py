@@ -38,7 +38,15 @@ def runs(room: Room, tmp_path_factory) -> Path:
         arguments = [
             *("match", "--images", str(folder / "images"), "--pairs", str(folder / "pairs.txt")),
             *("--cameras", str(folder / "cameras.txt"), "--labels", str(folder / "labels")),
-            *("--max-crop-pixels", "1000000", "--area-matcher", area_matcher, "--output", str(folder / area_matcher)),
+            *(
+                "--max-crop-pixels",
+                "1000000",
+                "--guidance.no-enabled",
+                "--area-matcher",
+                area_matcher,
+                "--output",
+                str(folder / area_matcher),
+            ),
         ]
         assert cli.run(arguments) == DONE
     return folder
