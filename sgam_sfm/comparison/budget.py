@@ -22,7 +22,7 @@ Cut = Callable[[Image, Box, CropOptions], Crop]
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Budget:
-    """What a budget led to. target, reached: pixels matched over all pairs. cap: what kept it from being spent."""
+    """What a budget led to. target, reached: pixels matched over all pairs. cap: why it was not met."""
 
     options: MatchOptions
     target: int
@@ -66,11 +66,16 @@ def fit_budget(
 
     size = _largest_within(target, pixels, _SMALLEST, largest)
     reached = pixels(size)
+    cap = ""
+    if size == largest and reached < 0.98 * target:
+        cap = f"capped at {limit} ({name.replace('_', '-')} {size})"
+    elif reached > 1.02 * target:
+        cap = f"it takes {reached / target:.0%} of it at least"
     return Budget(
         options=replace(options, crop=crop_options(size)),
         target=target,
         reached=reached,
-        cap=f"{limit} ({name.replace('_', '-')} {size})" if size == largest and reached < 0.98 * target else "",
+        cap=cap,
     )
 
 

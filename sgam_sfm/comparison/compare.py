@@ -185,7 +185,7 @@ def print_table(content: Mapping[str, Any], console: Console) -> None:
     print_figures(title, [method["name"] for method in methods], rows, console)
     for method in content["methods"]:
         if method["cap"]:
-            console.print(f"{method['name']}: the budget could not be spent, capped at {method['cap']}")
+            console.print(f"{method['name']}: the budget could not be met: {method['cap']}")
 
 
 def _cell(figure: Figure, method: Mapping[str, Any]) -> str:

@@ -71,7 +71,7 @@ def run_method(job: Job) -> dict[str, Any]:
     """Run a method, or find it done.
 
     Returns: summary (of `match`), pixels_extracted, saved_seconds (that results of earlier runs spared this one), and
-        cap (what kept a budget from being spent, empty: nothing).
+        cap (why a budget was not met, empty: it was).
     """
     job.options.output.mkdir(parents=True, exist_ok=True)
     stages = Stages()

@@ -45,12 +45,23 @@ def test_whole_images_grow_until_the_pixels_are_spent():
 
 @pytest.mark.parametrize(
     ("largest", "cap"),
-    [(4096, "the images' own resolution (image-size 2000)"), (1200, "--max-image-size (image-size 1200)")],
+    [
+        (4096, "capped at the images' own resolution (image-size 2000)"),
+        (1200, "capped at --max-image-size (image-size 1200)"),
+    ],
 )
 def test_a_cap_that_bites_is_told(largest, cap):
     budget = fit_budget(OPTIONS, IMAGES, PAIRS, 10**9, WholeImages(), {}, largest)
     assert budget.cap == cap
     assert budget.reached < budget.target
+
+
+def test_a_first_match_that_costs_more_than_the_budget_is_told():
+    whole = {pair: some_matches() for pair in PAIRS}
+    first = 2 * 2 * 1024 * 512
+    budget = fit_budget(OPTIONS, IMAGES, PAIRS, first // 2, Halves(), whole, 4096)
+    assert budget.reached > first
+    assert budget.cap == f"it takes {budget.reached / budget.target:.0%} of it at least"
 
 
 def test_areas_grow_where_there_are_some_and_whole_images_stay():

@@ -100,7 +100,7 @@ def remarks(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         if run["no_model"]:
             found.append((method["name"], f"no model: {run['no_model']}"))
         if method["cap"]:
-            found.append((method["name"], f"its budget could not be spent, capped at {method['cap']}"))
+            found.append((method["name"], f"its budget could not be met: {method['cap']}"))
         # Whole images are all that `none` matches.
         fallbacks = {} if method["name"].startswith("none:") else run["fallbacks"]
         for reason, count in fallbacks.items():
