@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,13 +32,22 @@ def find_device(name: str, named: str = "device") -> torch.device:
 
 
 def use_threads(number: int) -> None:
-    """Let torch and OpenCV use this many CPU threads (0: all)."""
+    """Let torch and OpenCV use this many CPU threads (0: as many as they would by themselves)."""
     import cv2
     import torch
 
-    if number:
-        torch.set_num_threads(number)
-        cv2.setNumThreads(number)
+    for_torch, for_opencv = _default_threads()
+    torch.set_num_threads(number or for_torch)
+    cv2.setNumThreads(number or for_opencv)
+
+
+@cache
+def _default_threads() -> tuple[int, int]:
+    """Those of torch and OpenCV before any were set: results differ in their last digits with the number."""
+    import cv2
+    import torch
+
+    return torch.get_num_threads(), cv2.getNumThreads()
 
 
 def peak_memory_mb() -> float | None:
