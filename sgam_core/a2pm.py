@@ -65,9 +65,10 @@ def match_described(
     point_matcher: PointMatcher,
     options: SGAMOptions,
 ) -> PairResult:
-    """The whole algorithm for two images whose areas have been described: SAM, PM, GP, GR, GMC.
+    """The whole algorithm for two images whose areas have been described: SAM, PM, GP, GR, GMC, and guided areas.
 
-    Crops are those of `area_crop`, unless the area matcher has a method `crop(image, box, options)` of its own.
+    Guided areas follow where the area matcher has an attribute `guides` that is true. Crops are those of `area_crop`,
+    unless it has a method `crop(image, box, options)` of its own.
     """
     points = _Points(image0, image1, point_matcher, options.crop, getattr(area_matcher, "crop", area_crop))
     estimate = partial(
@@ -84,13 +85,13 @@ def match_described(
         )
     found = _guided(first, points, estimate, options) or first if guides else first
     clock.lap("guided areas")
-    kept = [area.area for area in found.areas if area.area.state is AreaState.KEPT]
+    coverage0, coverage1 = _coverages(found.areas, points)
     return PairResult(
         matches=found.matches,
         areas=tuple(area.area for area in found.areas),
         two_view=found.model,
-        coverage0=coverage([area.area0.box for area in kept], image0.width, image0.height),
-        coverage1=coverage([area.area1.box for area in kept], image1.width, image1.height),
+        coverage0=coverage0,
+        coverage1=coverage1,
         whole_scale0=whole_crop(image0, options.crop).scale,
         whole_scale1=whole_crop(image1, options.crop).scale,
         fallback=found.fallback,
@@ -164,12 +165,12 @@ def _guided(first: _Found, points: _Points, estimate: Estimate, options: SGAMOpt
     verdict = reject(points.guided(proposed), points.whole, True, estimate, options.geometry, options.rejection)
     if verdict.fallback:
         return None
-    areas = (*first.areas, *verdict.areas)
-    matches = _collected(areas, verdict.model, lambda: first.matches, points, options, begin=len(first.areas))
     if verdict.model is None or (
         (residuals(verdict.model.F, agreeing) <= options.geometry.max_residual).mean() < options.guidance.min_agreement
     ):
         return None
+    areas = (*first.areas, *verdict.areas)
+    matches = _collected(areas, verdict.model, lambda: first.matches, points, options, begin=len(first.areas))
     return _Found(matches=matches, model=verdict.model, areas=areas, notes=first.notes)
 
 
@@ -184,12 +185,19 @@ def _collected(
     """The matches of the kept areas from row `begin` on, and the coarser ones where these leave ground (GMC)."""
     kept = [(row, area) for row, area in enumerate(areas) if row >= begin and area.area.state is AreaState.KEPT]
     inside = [replace(area.matches, area_index=np.full(len(area.matches), row, np.int32)) for row, area in kept]
-    covered = [
-        coverage([getattr(area.area, side).box for _, area in kept], image.width, image.height)
-        for side, image in zip(("area0", "area1"), points.images, strict=True)
-    ]
-    collected = collect(inside, min(covered), model, coarser, options.collection)
+    covered = min(_coverages(areas[begin:], points))
+    collected = collect(inside, covered, model, coarser, options.collection)
     return merge(inside, collected, options.collection)
+
+
+def _coverages(areas: Sequence[MatchedArea], points: _Points) -> tuple[float, float]:
+    """Share of each image inside the areas that are kept."""
+    kept = [area.area for area in areas if area.area.state is AreaState.KEPT]
+    image0, image1 = points.images
+    return (
+        coverage([area.area0.box for area in kept], image0.width, image0.height),
+        coverage([area.area1.box for area in kept], image1.width, image1.height),
+    )
 
 
 def match_whole(image0: Image, image1: Image, point_matcher: PointMatcher, options: CropOptions) -> Matches:

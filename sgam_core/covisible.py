@@ -55,8 +55,9 @@ class CovisibleAreaMatcher:
         used = consistent(whole, description0, description1, self.geometry) if self.options.verify else whole
         if len(used) < max(self.options.min_matches, 1):
             return PutativeAreas()
-        box0 = enclosing_box(used.points0, used.scores, description0, self.options)
-        box1 = enclosing_box(used.points1, used.scores, description1, self.options)
+        quantile, margin = self.options.quantile, self.options.margin
+        box0 = enclosing_box(used.points0, used.scores, description0, quantile, margin)
+        box1 = enclosing_box(used.points1, used.scores, description1, quantile, margin)
         if (box0, box1) == (description0.box, description1.box):
             return PutativeAreas()
         area0, area1 = Area(kind="covisible", box=box0), Area(kind="covisible", box=box1)
@@ -81,13 +82,17 @@ def consistent(matches: Matches, frame0: Frame, frame1: Frame, geometry: Geometr
 
 
 def enclosing_box(
-    points: Float[np.ndarray, "N 2"], scores: Float[np.ndarray, " N"], frame: Frame, options: CovisibleOptions
+    points: Float[np.ndarray, "N 2"], scores: Float[np.ndarray, " N"], frame: Frame, quantile: float, margin: float
 ) -> Box:
-    """The box about all but the outermost points and its margin, in whole pixels of the image."""
-    low, high = (sign * _quantile(sign * points, scores, options.quantile) for sign in (1, -1))
-    margin = options.margin * float((high - low).max())
-    x0, x1 = whole_pixels(float(low[0]) - margin, float(high[0]) + margin, frame.width)
-    y0, y1 = whole_pixels(float(low[1]) - margin, float(high[1]) + margin, frame.height)
+    """The box about all but the outermost points and its margin, in whole pixels of the image.
+
+    Args: quantile: share of the points, weighted by score, left out at each side. margin: added on each side, share of
+        the long side.
+    """
+    low, high = (sign * _quantile(sign * points, scores, quantile) for sign in (1, -1))
+    added = margin * float((high - low).max())
+    x0, x1 = whole_pixels(float(low[0]) - added, float(high[0]) + added, frame.width)
+    y0, y1 = whole_pixels(float(low[1]) - added, float(high[1]) + added, frame.height)
     return Box(x0=x0, y0=y0, x1=x1, y1=y1)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sgam_core.covisible import Frame, enclosing_box
-from sgam_core.options import CovisibleOptions, CropOptions, GuidanceOptions
+from sgam_core.options import CropOptions, GuidanceOptions
 from sgam_core.types import Area, AreaMatch, Box, Matches
 
 _STRAY = 0.05  # a smaller share of a window's matches is no reason to look there
@@ -118,10 +118,9 @@ def _window(
     matches: Matches, rows: Int[np.ndarray, " N"], frame0: Frame, frame1: Frame, options: GuidanceOptions
 ) -> _Window:
     chosen = matches.select(rows)
-    enclosing = CovisibleOptions(quantile=options.quantile, margin=options.margin)
     boxes = (
-        enclosing_box(chosen.points0, chosen.scores, frame0, enclosing),
-        enclosing_box(chosen.points1, chosen.scores, frame1, enclosing),
+        enclosing_box(chosen.points0, chosen.scores, frame0, options.quantile, options.margin),
+        enclosing_box(chosen.points1, chosen.scores, frame1, options.quantile, options.margin),
     )
     ratio = _size_ratio(chosen.points0, chosen.points1)
     return _Window(boxes=boxes, scales=(min(1.0, ratio), min(1.0, 1 / ratio)), sigma=float(np.median(chosen.sigmas)))

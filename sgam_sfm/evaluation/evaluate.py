@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import inf
 from pathlib import Path
@@ -91,6 +91,7 @@ def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
     labels = make_label_maps(common, inputs.images, stages) if needs_labels else None
     matcher = CachedMatcher.of(common, inputs, common.output / "cache" / "matches")
 
+    shown = {} if labels is None else _shown_labels(labels, {name for pair in pairs for name in pair})
     facts = {}
     whole: dict[Pair, Matches] = {}
     plain = CollectionMatcher(replace(common, area_matcher="none"), inputs, labels, matcher)
@@ -101,7 +102,8 @@ def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
             except SGAMError:  # the pair counts as failed in every variant
                 whole[pair] = Matches.empty()
             true = true_pair(truth, _views(truth, names, pair), whole[pair])
-            facts[pair] = replace(true, num_labels=_num_labels(labels, pair))
+            num_labels = len(set.intersection(*(shown[name] for name in pair))) if shown.keys() >= {*pair} else None
+            facts[pair] = replace(true, num_labels=num_labels)
             advance(1)
     judged = {}
     for variant in variants:
@@ -278,14 +280,11 @@ def _title(part: tuple[float, float] | str) -> str:
     return f"{part[0]:g}-{part[1]:g}" if part[1] < inf else f"from {part[0]:g}"
 
 
-def _num_labels(labels: LabelMaps | None, pair: Pair) -> int | None:
-    """Labels that both images show; None without label maps."""
-    if labels is None or not labels.set.failed.keys().isdisjoint(pair):
-        return None
-    shown = (set(np.flatnonzero(_shares(labels.read(name)) >= _SHOWN).tolist()) for name in pair)
-    return len(set.intersection(*shown) - {labels.set.void, *labels.set.ignored})
-
-
-def _shares(labels: np.ndarray) -> np.ndarray:
-    """Share of the pixels by id."""
-    return np.bincount(labels.ravel()) / labels.size
+def _shown_labels(labels: LabelMaps, names: Collection[str]) -> dict[str, set[int]]:
+    """The labels that each image shows; images without a label map are left out."""
+    without = {labels.set.void, *labels.set.ignored}
+    shown = {}
+    for name in sorted({*names} - labels.set.failed.keys()):
+        ids, counts = np.unique(labels.read(name), return_counts=True)
+        shown[name] = set(ids[counts >= _SHOWN * counts.sum()].tolist()) - without
+    return shown

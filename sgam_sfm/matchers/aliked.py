@@ -11,19 +11,16 @@ from kornia import feature
 from torch import Tensor
 
 from sgam_core.types import Crop
-from sgam_sfm.machine import find_device
 from sgam_sfm.matchers.frames import ready, rgb_frames
-from sgam_sfm.matchers.lightglue import LightGlueAssignment
+from sgam_sfm.matchers.lightglue import with_lightglue
 from sgam_sfm.matchers.peaks import parabola, peaks
-from sgam_sfm.matchers.sparse import Features, SparseMatcher, batch_size, checked_count
+from sgam_sfm.matchers.sparse import MIN_SIDE, Features, SparseMatcher, checked_count
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
-from sgam_sfm.matchers.subpixel import aligned
-from sgam_sfm.weights import ALIKED, ALIKED_LIGHTGLUE, find_all_weights
+from sgam_sfm.weights import ALIKED, ALIKED_LIGHTGLUE
 
 MODEL = "aliked-n16"
 CHANNELS = 128
 MULTIPLE = 32
-MIN_SIDE = 32  # pixels of a crop, below which there are no features
 _GRID = "dkd.hw_grid"  # a constant of the architecture, in no file
 
 
@@ -71,11 +68,14 @@ def aliked_lightglue(
         that go through a network together; 0: 1 on the CPU, 8 elsewhere.
     Raises: WeightsError when there are no weights or they are not those of the models; OptionError for wrong options.
     """
-    place, files = find_device(device), find_all_weights((ALIKED, ALIKED_LIGHTGLUE), weights)
-    together = batch_size(place, batch)
-    return SparseMatcher(
-        ALIKEDExtractor(files[0], max_features, place),
-        LightGlueAssignment(files[1], place, batch_size=together, min_score=min_score, input_dim=CHANNELS),
-        refine=aligned if photometric else None,
-        batch_size=together,
+    return with_lightglue(
+        ALIKEDExtractor,
+        (ALIKED, ALIKED_LIGHTGLUE),
+        weights=weights,
+        device=device,
+        max_features=max_features,
+        min_score=min_score,
+        photometric=photometric,
+        batch=batch,
+        input_dim=CHANNELS,
     )

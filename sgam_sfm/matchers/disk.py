@@ -16,18 +16,15 @@ from torch.nn.functional import normalize
 
 from sgam_core.errors import WeightsError
 from sgam_core.types import Crop
-from sgam_sfm.machine import find_device
 from sgam_sfm.matchers.frames import ready, rgb_frames
-from sgam_sfm.matchers.lightglue import LightGlueAssignment
+from sgam_sfm.matchers.lightglue import with_lightglue
 from sgam_sfm.matchers.peaks import parabola, peaks
-from sgam_sfm.matchers.sparse import Features, SparseMatcher, batch_size, checked_count
+from sgam_sfm.matchers.sparse import MIN_SIDE, Features, SparseMatcher, checked_count
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
-from sgam_sfm.matchers.subpixel import aligned
-from sgam_sfm.weights import DISK, DISK_LIGHTGLUE, find_all_weights
+from sgam_sfm.weights import DISK, DISK_LIGHTGLUE
 
 CHANNELS = 128
 MULTIPLE = 16
-MIN_SIDE = 32  # pixels of a crop, below which there are no features
 
 
 class DISKExtractor:
@@ -70,11 +67,14 @@ def disk_lightglue(
 
     Args and errors: as `aliked_lightglue`.
     """
-    place, files = find_device(device), find_all_weights((DISK, DISK_LIGHTGLUE), weights)
-    together = batch_size(place, batch)
-    return SparseMatcher(
-        DISKExtractor(files[0], max_features, place),
-        LightGlueAssignment(files[1], place, batch_size=together, min_score=min_score, input_dim=CHANNELS),
-        refine=aligned if photometric else None,
-        batch_size=together,
+    return with_lightglue(
+        DISKExtractor,
+        (DISK, DISK_LIGHTGLUE),
+        weights=weights,
+        device=device,
+        max_features=max_features,
+        min_score=min_score,
+        photometric=photometric,
+        batch=batch,
+        input_dim=CHANNELS,
     )

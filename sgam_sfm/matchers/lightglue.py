@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,11 @@ import torch
 from kornia.feature import LightGlue as Network
 from torch import Tensor
 
-from sgam_sfm.matchers.sparse import Assignment, Features
+from sgam_sfm.machine import find_device
+from sgam_sfm.matchers.sparse import Assignment, Extract, Features, SparseMatcher, batch_size
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
+from sgam_sfm.matchers.subpixel import aligned
+from sgam_sfm.weights import WeightsSpec, find_all_weights
 
 _OLD_NAME = re.compile(r"^(self_attn|cross_attn)\.(\d+)\.")
 _THRESHOLDS = "confidence_thresholds"  # follows from the number of layers; not every file has it
@@ -73,6 +76,33 @@ class LightGlueAssignment:
             frames = torch.stack([side.frames for side in sides if side.frames is not None])
             inputs |= {"scales": frames[..., 0], "oris": frames[..., 1]}
         return inputs
+
+
+def with_lightglue(
+    extractor: Callable[[Path, int, torch.device], Extract],
+    specs: tuple[WeightsSpec, WeightsSpec],
+    *,
+    weights: Path | None,
+    device: str,
+    max_features: int,
+    min_score: float,
+    photometric: bool,
+    batch: int,
+    **config: Any,
+) -> SparseMatcher:
+    """A sparse matcher of an extractor, made of (file, max_features, device), and LightGlue.
+
+    Args: specs: the weights of the extractor and of LightGlue. config: of `LightGlueAssignment`. The others are those
+        of every such matcher, see `aliked_lightglue`.
+    """
+    place, files = find_device(device), find_all_weights(specs, weights)
+    together = batch_size(place, batch)
+    return SparseMatcher(
+        extractor(files[0], max_features, place),
+        LightGlueAssignment(files[1], place, batch_size=together, min_score=min_score, **config),
+        refine=aligned if photometric else None,
+        batch_size=together,
+    )
 
 
 def _nothing(side: Features) -> Assignment:

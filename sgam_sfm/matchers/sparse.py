@@ -19,6 +19,7 @@ from sgam_sfm.matchers.feature_cache import FeatureCache
 from sgam_sfm.matchers.masks import wanted
 
 CACHE_BYTES = 512 * 2**20
+MIN_SIDE = 32  # pixels of a crop, below which networks give no features
 CUDA_BATCH = 8  # crops, or pairs of them, that go through a network together
 
 

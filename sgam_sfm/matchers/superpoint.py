@@ -15,18 +15,15 @@ from torch import Tensor, nn
 from torch.nn.functional import grid_sample, max_pool2d, normalize, pixel_shuffle, relu
 
 from sgam_core.types import Crop
-from sgam_sfm.machine import find_device
 from sgam_sfm.matchers.frames import ready, rgb_frames
-from sgam_sfm.matchers.lightglue import LightGlueAssignment
+from sgam_sfm.matchers.lightglue import with_lightglue
 from sgam_sfm.matchers.peaks import parabola, peaks
-from sgam_sfm.matchers.sparse import Features, SparseMatcher, batch_size, checked_count
+from sgam_sfm.matchers.sparse import MIN_SIDE, Features, SparseMatcher, checked_count
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
-from sgam_sfm.matchers.subpixel import aligned
-from sgam_sfm.weights import SUPERPOINT, SUPERPOINT_LIGHTGLUE, find_all_weights
+from sgam_sfm.weights import SUPERPOINT, SUPERPOINT_LIGHTGLUE
 
 CELL = 8
 CHANNELS = 256
-MIN_SIDE = 32  # pixels of a crop, below which there are no features
 RADIUS = 4
 MIN_PROBABILITY = 0.0005  # of a keypoint within its cell, as with LightGlue
 _STAGES = (("1", 1, 64), ("2", 64, 64), ("3", 64, 128), ("4", 128, 128))  # two convolutions each, pooled between
@@ -103,11 +100,14 @@ def superpoint_lightglue(
 
     Args and errors: as `aliked_lightglue`.
     """
-    place, files = find_device(device), find_all_weights((SUPERPOINT, SUPERPOINT_LIGHTGLUE), weights)
-    together = batch_size(place, batch)
-    return SparseMatcher(
-        SuperPointExtractor(files[0], max_features, place),
-        LightGlueAssignment(files[1], place, batch_size=together, min_score=min_score, input_dim=CHANNELS),
-        refine=aligned if photometric else None,
-        batch_size=together,
+    return with_lightglue(
+        SuperPointExtractor,
+        (SUPERPOINT, SUPERPOINT_LIGHTGLUE),
+        weights=weights,
+        device=device,
+        max_features=max_features,
+        min_score=min_score,
+        photometric=photometric,
+        batch=batch,
+        input_dim=CHANNELS,
     )

@@ -30,6 +30,7 @@ from sgam_core.types import Crop, Matches
 from sgam_sfm.machine import find_device
 from sgam_sfm.matchers.feature_cache import FeatureCache
 from sgam_sfm.matchers.masks import wanted
+from sgam_sfm.matchers.sparse import batch_size as together
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
 from sgam_sfm.matchers.subpixel import aligned
 from sgam_sfm.weights import XFEAT, find_weights
@@ -116,7 +117,7 @@ class XFeatStar:
         self.min_cosine = min_cosine
         self.photometric = photometric
         self.features: FeatureCache[_Features] = FeatureCache(
-            self._extract, batch_size=batch_size or (1 if self.device.type == "cpu" else 8), max_bytes=cache_bytes
+            self._extract, batch_size=together(self.device, batch_size), max_bytes=cache_bytes
         )
         self._net = load_xfeat(find_weights(XFEAT, weights), sparse=False).to(self.device)
 

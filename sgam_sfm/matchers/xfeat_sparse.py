@@ -16,17 +16,14 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize, pixel_shuffle
 
 from sgam_core.types import Crop
-from sgam_sfm.machine import find_device
 from sgam_sfm.matchers.frames import rgb_frames
-from sgam_sfm.matchers.lightglue import LightGlueAssignment
+from sgam_sfm.matchers.lightglue import with_lightglue
 from sgam_sfm.matchers.peaks import parabola, peaks
-from sgam_sfm.matchers.sparse import Features, SparseMatcher, batch_size, checked_count
-from sgam_sfm.matchers.subpixel import aligned
+from sgam_sfm.matchers.sparse import MIN_SIDE, Features, SparseMatcher, checked_count
 from sgam_sfm.matchers.xfeat import CELL, MULTIPLE, load_xfeat
-from sgam_sfm.weights import LIGHTERGLUE, XFEAT, find_all_weights
+from sgam_sfm.weights import LIGHTERGLUE, XFEAT
 
 CHANNELS = 64
-MIN_SIDE = 32  # pixels of a crop, below which there are no features
 MIN_PROBABILITY = 0.05  # of a keypoint within its cell, as published
 CONFIG = {"input_dim": CHANNELS, "descriptor_dim": 96, "n_layers": 6, "num_heads": 1, "depth_confidence": -1}
 
@@ -81,11 +78,14 @@ def xfeat_lighterglue(
 
     Args and errors: as `aliked_lightglue`.
     """
-    place, files = find_device(device), find_all_weights((XFEAT, LIGHTERGLUE), weights)
-    together = batch_size(place, batch)
-    return SparseMatcher(
-        XFeatExtractor(files[0], max_features, place),
-        LightGlueAssignment(files[1], place, batch_size=together, min_score=min_score, **CONFIG),
-        refine=aligned if photometric else None,
-        batch_size=together,
+    return with_lightglue(
+        XFeatExtractor,
+        (XFEAT, LIGHTERGLUE),
+        weights=weights,
+        device=device,
+        max_features=max_features,
+        min_score=min_score,
+        photometric=photometric,
+        batch=batch,
+        **CONFIG,
     )
