@@ -32,10 +32,10 @@ def room() -> Room:
 
 @pytest.fixture(scope="session")
 def tutorial(room: Room, tmp_path_factory) -> Path:
-    """A folder where the first tutorial has been followed, on four views of the room: `photos` and the run `out`."""
+    """A folder where the first tutorial has been followed, on three views of the room: `photos` and the run `out`."""
     folder: Path = tmp_path_factory.mktemp("tutorial")
     (folder / "photos").mkdir()
-    for name in list(room.images)[:4]:
+    for name in list(room.images)[:3]:
         PIL.Image.fromarray(room.images[name].pixels).save(folder / "photos" / name, quality=95)
     follow(DOCS / "tutorials/photos.md", folder)
     return folder

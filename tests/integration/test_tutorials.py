@@ -16,7 +16,7 @@ from sgam_sfm.colmap_reading import database_content
 from sgam_sfm.pairs import read_pairs
 from tests.tutorials import DOCS, ROOT, Block, blocks, follow
 
-PHOTOS = [f"view{number:02}.jpg" for number in (2, 3, 4, 5)]
+PHOTOS = [f"view{number:02}.jpg" for number in (2, 3, 4)]
 MATCHES_OF_HLOC = "feats-superpoint-n4096-r1024_matches-superpoint-lightglue_pairs-netvlad.h5"
 
 
@@ -26,13 +26,12 @@ def summary_of(output: Path) -> dict:
 
 def test_a_model_of_all_photos(tutorial, capfd):
     (model,) = summary_of(tutorial / "out")["models"]
-    assert (model["registered"], model["total"]) == (4, 4)
+    assert (model["registered"], model["total"]) == (3, 3)
     assert model["points"] > 600
     assert pycolmap.Reconstruction(tutorial / "out/sparse/0").num_cameras() == 1
-    assert pycolmap.Reconstruction(tutorial / "out_global/sparse/0").num_reg_images() == 4
+    assert pycolmap.Reconstruction(tutorial / "out_global/sparse/0").num_reg_images() == 3
     assert {path.name for path in (tutorial / "out/pictures").iterdir()} == {
         "collection.png",
-        "view03.jpg.png",
         "view03.jpg--view04.jpg.png",
     }
 
@@ -42,9 +41,7 @@ def hloc(tutorial: Path) -> Path:
     """What hloc would have left in its export folder, in its layout."""
     folder = tutorial / "hloc"
     (folder / "sfm").mkdir(parents=True)
-    (folder / "pairs-netvlad.txt").write_text(
-        "view02.jpg view03.jpg\nview03.jpg view02.jpg\nview03.jpg view04.jpg\nview05.jpg view04.jpg"
-    )
+    (folder / "pairs-netvlad.txt").write_text("view02.jpg view03.jpg\nview03.jpg view02.jpg\nview04.jpg view03.jpg")
     with h5py.File(folder / "global-feats-netvlad.h5", "w") as file:
         for number, name in enumerate(PHOTOS):
             angle = 0.3 * number
@@ -59,14 +56,11 @@ def test_hlocs_files_are_taken_and_given_back(tutorial, hloc):
     before = database_content(hloc / "sfm/database.db")
     follow(DOCS / "tutorials/hloc.md", tutorial)
     pairs = summary_of(tutorial / "out_hloc")["pairs"]
-    assert (pairs["listed"], pairs["matched"]) == (3, 3)
-    assert summary_of(tutorial / "out_hloc")["models"][0]["registered"] == 4
-    neighbours = {("view02.jpg", "view03.jpg"), ("view03.jpg", "view04.jpg"), ("view04.jpg", "view05.jpg")}
-    retrieved = set(read_pairs(tutorial / "retrieved.txt", PHOTOS).pairs)
-    assert neighbours < retrieved
-    assert ("view02.jpg", "view05.jpg") not in retrieved
-    assert neighbours <= set(read_pairs(tutorial / "matched.txt", PHOTOS).pairs)
-    assert pycolmap.Reconstruction(tutorial / "remapped/sparse/0").num_reg_images() == 4
+    assert (pairs["listed"], pairs["matched"]) == (2, 2)
+    assert summary_of(tutorial / "out_hloc")["models"][0]["registered"] == 3
+    for name, pairs in (("retrieved.txt", 3), ("matched.txt", 3)):
+        assert len(read_pairs(tutorial / name, PHOTOS).pairs) == pairs
+    assert pycolmap.Reconstruction(tutorial / "remapped/sparse/0").num_reg_images() == 3
     after = database_content(hloc / "sfm/database.db")
     for name in PHOTOS:
         kept = len(before["keypoints"][name])
@@ -92,8 +86,6 @@ def test_a_package_of_its_own_brings_a_matcher_and_a_segmenter(tutorial, tmp_pat
     assert (options["matcher"], options["segmenter"]) == ("orb", "hues")
     labels = json.loads((tutorial / "out_orb/labels/labels.json").read_text())
     assert labels["segmenter"] == "hues"
-    with PIL.Image.open(tutorial / "hues/view03.jpg.png") as labels:
-        assert len(np.unique(np.asarray(labels))) >= 3
 
 
 def test_the_page_shows_the_package_as_it_is():
