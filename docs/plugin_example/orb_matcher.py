@@ -19,5 +19,5 @@ class Orb:
 
     def _match(self, points0, seen0, points1, seen1):
         found = cv2.BFMatcher(cv2.NORM_HAMMING, True).match(seen0, seen1) if len(points0) and len(points1) else []
-        rows0, rows1 = np.array([(match.queryIdx, match.trainIdx) for match in found], int).reshape(-1, 2).T
-        return Matches(points0=points0[rows0], points1=points1[rows1], scores=[1 - m.distance / 256 for m in found])
+        rows0, rows1, bits = np.array([(m.queryIdx, m.trainIdx, m.distance) for m in found], int).reshape(-1, 3).T
+        return Matches(points0=points0[rows0], points1=points1[rows1], scores=1 - bits / 256)

@@ -2,10 +2,9 @@
 
 pycolmap is COLMAP's own reader. nerfstudio and gsplat do not install beside this project (they bring a torch and an
 OpenCV of their own), so what their loaders read is read here in their way: the same files, fields and types, and the
-same look-ups. Sources, all read in 2026: nerfstudio 1.1.5 `data/utils/colmap_parsing_utils.py` and
-`data/dataparsers/colmap_dataparser.py`; gsplat `examples/datasets/colmap.py`, whose released versions use the
-`SceneManager` of a pycolmap fork; hloc `utils/io.py` and `triangulation.py`. Where nerfstudio is installed, its own
-reader is asked, too.
+same look-ups. Theirs are nerfstudio 1.1.5 `data/utils/colmap_parsing_utils.py` and `data/dataparsers/
+colmap_dataparser.py`; gsplat `examples/datasets/colmap.py`, whose older versions use the `SceneManager` of a fork of
+pycolmap; hloc `utils/io.py` and `triangulation.py`. Where nerfstudio is installed, its own reader is asked, too.
 """
 
 from __future__ import annotations

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 
 import h5py
 import numpy as np
@@ -12,8 +14,11 @@ import PIL.Image
 import pycolmap
 import pytest
 
+from sgam_core.errors import InputError
 from sgam_sfm.colmap_reading import database_content
+from sgam_sfm.images import inspect_image
 from sgam_sfm.pairs import read_pairs
+from tests.textures import similarity, transfer, view, whole
 from tests.tutorials import DOCS, ROOT, Block, blocks, follow
 
 PHOTOS = [f"view{number:02}.jpg" for number in (2, 3, 4)]
@@ -24,7 +29,7 @@ def summary_of(output: Path) -> dict:
     return json.loads((output / "summary.json").read_text())
 
 
-def test_a_model_of_all_photos(tutorial, capfd):
+def test_a_model_of_all_photos(tutorial):
     (model,) = summary_of(tutorial / "out")["models"]
     assert (model["registered"], model["total"]) == (3, 3)
     assert model["points"] > 600
@@ -86,6 +91,49 @@ def test_a_package_of_its_own_brings_a_matcher_and_a_segmenter(tutorial, tmp_pat
     assert (options["matcher"], options["segmenter"]) == ("orb", "hues")
     labels = json.loads((tutorial / "out_orb/labels/labels.json").read_text())
     assert labels["segmenter"] == "hues"
+
+
+def example(name: str) -> ModuleType:
+    """A module of the package, without installing it."""
+    spec = spec_from_file_location(name, DOCS / f"plugin_example/{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_matcher_of_the_page_keeps_to_the_protocol():
+    warp = similarity(1.1, 6, (7.3, -4.6), (160, 120))
+    first, second = (view(each, (320, 240)) for each in (np.eye(3), warp))
+    left = np.arange(320) < 160
+    crops = (whole(first, "first"), whole(second, "second"))
+    masked = (whole(first, "half", np.tile(left, (240, 1))), crops[1])
+    blank = whole(np.full((100, 200, 3), 90, np.uint8), "gray")
+    matches, halved, none = example("orb_matcher").Orb().match([crops, masked, (blank, blank)])
+    distances = np.linalg.norm(transfer(warp, matches.points0) - matches.points1, axis=1)
+    assert (distances < 2).sum() > 100
+    assert np.median(distances[distances < 2]) < 0.8
+    assert len(halved) > 20
+    assert left[halved.points0[:, 0].astype(int)].all()
+    assert len(none) == 0
+
+
+def test_the_segmenter_of_the_page_gives_equal_hues_equal_labels(tmp_path):
+    for name, colours in {"a.png": [(200, 30, 30), (128, 128, 128)], "b.png": [(30, 30, 200), (210, 40, 40)]}.items():
+        PIL.Image.fromarray(np.repeat(np.array([colours], np.uint8), 40, axis=1).repeat(60, axis=0)).save(
+            tmp_path / name
+        )
+    (tmp_path / "c.png").write_bytes((tmp_path / "a.png").read_bytes())
+    files = [inspect_image(tmp_path, name) for name in ("a.png", "b.png", "c.png")]
+    (tmp_path / "c.png").write_bytes(b"broken since")
+    shares = []
+    (_, a), (_, b), (_, c) = example("hue_segmenter").Hues().segment(files, shares.append)
+    assert shares == [1.0, 1.0, 1.0]
+    assert a[30, 10] == b[30, 70] > 0
+    assert a[30, 70] == 0
+    assert b[30, 10] not in (0, a[30, 10])
+    assert isinstance(c, InputError)
 
 
 def test_the_page_shows_the_package_as_it_is():
