@@ -146,6 +146,10 @@ def test_the_page_shows_the_package_as_it_is():
     assert shown == package
 
 
+def test_the_readme_shows_the_same_matcher():
+    assert (DOCS / "plugin_example/orb_matcher.py").read_text() in [block.text for block in blocks(ROOT / "README.md")]
+
+
 def test_commands_of_the_home_page_run(tmp_path, capsys):
     assert follow(DOCS / "index.md", tmp_path) == ["sgam-sfm --help"]
     assert "Semantic area-to-point matching" in capsys.readouterr().out
