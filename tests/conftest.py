@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import jaxtyping
 import pytest
 
+from tests.hub_models import save_hub_model
 from tests.paths import DATA
 from tests.room import Room, small_room
+
+# Read when huggingface_hub is imported: tests take no model from the network, and do not wait for one.
+os.environ["HF_HUB_OFFLINE"] = "1"
 
 
 @pytest.fixture(scope="session")
@@ -26,6 +32,12 @@ def data() -> Path:
 def room() -> Room:
     """The rendered room, in small."""
     return small_room()
+
+
+@pytest.fixture(scope="session")
+def hub_model(tmp_path_factory) -> Callable[[str], Path]:
+    """The folder of a tiny model of some kind of the Hugging Face hub's, made once."""
+    return cache(lambda kind: save_hub_model(kind, tmp_path_factory.mktemp(kind)))
 
 
 @pytest.fixture
