@@ -123,7 +123,13 @@ def _efficient_loftr(t: Any, folder: Path) -> None:
         num_attention_layers=2,
         coarse_matching_threshold=0.0,
     )
-    t.EfficientLoFTRForKeypointMatching(config).save_pretrained(folder)
+    net = t.EfficientLoFTRForKeypointMatching(config)
+    for module in net.modules():  # transformers' own start is so small that all features are nearly 0
+        if isinstance(module, torch.nn.BatchNorm2d):
+            torch.nn.init.ones_(module.weight)
+        elif isinstance(module, torch.nn.Conv2d | torch.nn.Linear):
+            torch.nn.init.kaiming_normal_(module.weight)
+    net.save_pretrained(folder)
 
 
 _MAKERS: dict[str, Callable[[Any, Path], None]] = {

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import pad, softmax
+from torch.nn.functional import interpolate, pad, scaled_dot_product_attention, softmax
 
 from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Crop, Matches
@@ -127,8 +128,8 @@ class EfficientLoFTR:
             coarse0 = layer.self_attention(coarse0, position_embeddings=position0)
             coarse1 = layer.self_attention(coarse1, position_embeddings=position1)
             # The second side looks at the first one after it has changed: so the network was trained.
-            coarse0 = layer.cross_attention(coarse0, coarse1)
-            coarse1 = layer.cross_attention(coarse1, coarse0)
+            coarse0 = _cross_attention(layer.cross_attention, coarse0, coarse1)
+            coarse1 = _cross_attention(layer.cross_attention, coarse1, coarse0)
         coarse = [features / self.config.hidden_size**0.5 for features in (coarse0, coarse1)]
         fusion = self._net.refinement_layer
         fine = [
@@ -214,6 +215,22 @@ def _folder(weights: Path, model: str) -> str:
     if weights.is_file() and weights.name != "model.safetensors":
         raise WeightsError(f"'{model}': expected model.safetensors with config.json beside it, or their folder")
     return str((weights.parent if weights.is_file() else weights).absolute())
+
+
+def _cross_attention(
+    block: Any, side: Float[Tensor, "B C h w"], other: Float[Tensor, "B C h1 w1"]
+) -> Float[Tensor, "B C h w"]:
+    """One side after a look at the other; transformers runs the block on sides of equal size only."""
+    attention, step = block.attention, block.q_aggregation_kernel_size
+    query, keys = (states.flatten(1, 2) for states in block.aggregation(side, other))
+    parts = (attention.q_proj(query), attention.k_proj(keys), attention.v_proj(keys))
+    heads = (part.reshape(*part.shape[:2], -1, attention.head_dim).transpose(1, 2) for part in parts)
+    seen = scaled_dot_product_attention(*heads, scale=attention.scaling).transpose(1, 2).flatten(2)
+    batch, channels, height, width = side.shape
+    coarser = attention.o_proj(seen).mT.reshape(batch, channels, height // step, width // step)
+    message = interpolate(coarser, (height, width), mode="bilinear")
+    update: Tensor = block.mlp(torch.cat([side, message], 1).permute(0, 2, 3, 1))
+    return side + update.permute(0, 3, 1, 2)
 
 
 def _inner(features: Float[Tensor, "C h w"], border: int) -> Tensor:
