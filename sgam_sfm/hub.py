@@ -83,7 +83,12 @@ def download(name: str, model: str) -> Path:
     transformers_for(model)
     from huggingface_hub import snapshot_download
 
-    return Path(load(lambda hub_id, **settings: snapshot_download(hub_id, **settings), name, model))
+    def fetch(hub_id: str, local_files_only: bool = False) -> str:
+        if local_files_only:
+            raise OSError("the cache may have a part of it only")
+        return str(snapshot_download(hub_id))
+
+    return Path(load(fetch, name, model))
 
 
 def in_cache(name: str) -> Path | None:
