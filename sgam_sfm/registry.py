@@ -39,8 +39,8 @@ def create(kind: str, name: str, **settings: Any) -> Any:
 
     Of `settings` those are passed on that the model's constructor takes, so that a matcher of a few lines needs no
     constructor at all.
-    Raises: OptionError for an unknown name, with the nearest one, for a `rest` where none is taken, or when a package
-        that it needs is not installed.
+    Raises: OptionError for an unknown name, with the nearest one, for a `rest` that is empty or not taken, or when a
+        package that it needs is not installed.
     """
     entry = require(kind, name)
     _, colon, rest = name.partition(":")
@@ -49,6 +49,8 @@ def create(kind: str, name: str, **settings: Any) -> Any:
         taken = inspect.signature(factory).parameters
         if colon and "name" not in taken:
             raise OptionError(f"--{kind} '{name}': '{entry.name}' is one model; give --{kind} {entry.name}")
+        if colon and not rest:
+            raise OptionError(f"--{kind} '{name}' names no model; give one after the colon: a hub id or a folder")
         settings |= {"name": rest} if colon else {}
         return factory(**{key: value for key, value in settings.items() if key in taken})
     except ModuleNotFoundError as error:

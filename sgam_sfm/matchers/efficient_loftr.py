@@ -224,8 +224,8 @@ def _cross_attention(
     attention, step = block.attention, block.q_aggregation_kernel_size
     query, keys = (states.flatten(1, 2) for states in block.aggregation(side, other))
     parts = (attention.q_proj(query), attention.k_proj(keys), attention.v_proj(keys))
-    heads = (part.reshape(*part.shape[:2], -1, attention.head_dim).transpose(1, 2) for part in parts)
-    seen = scaled_dot_product_attention(*heads, scale=attention.scaling).transpose(1, 2).flatten(2)
+    q, k, v = (part.reshape(*part.shape[:2], -1, attention.head_dim).transpose(1, 2) for part in parts)
+    seen = scaled_dot_product_attention(q, k, v, scale=attention.scaling).transpose(1, 2).flatten(2)
     batch, channels, height, width = side.shape
     coarser = attention.o_proj(seen).mT.reshape(batch, channels, height // step, width // step)
     message = interpolate(coarser, (height, width), mode="bilinear")

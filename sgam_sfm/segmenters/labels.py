@@ -40,10 +40,10 @@ class LabelFolder:
 
     @property
     def label_set(self) -> LabelSet:
-        """What is known of the ids: of instances that are kept apart, those of the maps read so far."""
+        """What is known of the ids; among them the instances, where they are kept apart, of the maps read so far."""
         if self._table is None:
             return self._given
-        ids = sorted(self._seen) if self._table.instances == APART else self._table.names
+        ids = sorted({*self._table.names, *self._seen} - {0})
         by_id = {label: Label(id=label, name=self._table.name_of(label)) for label in ids}
         return replace(self._given, labels=(*(by_id | {label.id: label for label in self._given.labels}).values(),))
 

@@ -134,7 +134,8 @@ def test_features_change_with_the_part_of_the_image_that_changes(hub_model):
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("hf:", "'hf:' names no model; give its hub id or folder, such as hf:OWNER/NAME"),
+        ("hf:", "--segmenter 'hf:' names no model; give one after the colon: a hub id or a folder"),
+        ("coseg:", "--segmenter 'coseg:' names no model; give one after the colon: a hub id or a folder"),
         (
             "hf:./nowhere",
             "'hf:./nowhere': the folder './nowhere' does not exist; give one as `hf download` writes it, or a hub id",

@@ -117,7 +117,8 @@ def test_instances_become_their_classes_or_stay_apart(tmp_path, label_names):
     assert label_set.ids("car", "--mask-matches") == (26,)
     labels, label_set = read(tmp_path, values, f"{label_names}:instances")
     assert labels == values
-    assert label_set.ids("person,car", "--mask-matches") == (24, 24000, 26001, 26012)
+    assert label_set.ids("person,car", "--mask-matches") == (24, 24000, 26, 26001, 26012)
+    assert label_set.ids("sky", "--mask-matches") == (23,)
     assert names(label_set)[33999] == "bicycle"
 
 
