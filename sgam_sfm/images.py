@@ -180,9 +180,24 @@ def read_label_map(path: Path) -> Int32[np.ndarray, "H W"]:
     if not (picture.mode in ("1", "L", "P", "I") or picture.mode.startswith("I;16")):
         raise InputError(
             f"label map '{path}' has the colours of a picture (mode {picture.mode}); expected one channel of ids, "
-            "8 or 16 bits or a palette; export the ids"
+            "8 or 16 bits or a palette; export the ids, or name the JSON of panoptic maps by --label-names"
         )
     return np.asarray(picture).astype(np.int32) // picture.info.get("grey_step", 1)
+
+
+def read_segments(path: Path) -> Int32[np.ndarray, "H W"]:
+    """The segment ids of a panoptic PNG as COCO writes them: red + 256 green + 65536 blue.
+
+    Raises: InputError when the file is missing or broken, or has no colours.
+    """
+    picture = _decode(_read(path, "label map"), str(path))
+    if picture.mode not in ("RGB", "RGBA"):
+        raise InputError(
+            f"label map '{path}' has one channel (mode {picture.mode}); expected a panoptic PNG with ids as red + 256 "
+            "green + 65536 blue; leave --label-names out for a map of ids"
+        )
+    red, green, blue = np.moveaxis(np.asarray(picture.convert("RGB")).astype(np.int32), 2, 0)
+    return red + 256 * green + 65536 * blue
 
 
 def _files(root: Path) -> Iterator[Path]:

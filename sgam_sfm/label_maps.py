@@ -13,7 +13,7 @@ from jaxtyping import Bool, Int32
 from PIL import Image as PillowImage
 
 from sgam_core import layout_labels
-from sgam_core.errors import InputError
+from sgam_core.errors import InputError, OptionError
 from sgam_sfm import registry
 from sgam_sfm.colours import distinct_colour
 from sgam_sfm.files import replacing, write_json
@@ -59,12 +59,18 @@ def make_label_maps(options: MatchOptions, images: Mapping[str, ImageFile], stag
 
 
 def create_segmenter(options: MatchOptions | SegmentOptions, cache_folder: Path) -> Segmenter:
-    """The segmenter of the options: a folder of maps when --labels is given."""
+    """The segmenter of the options: a folder of maps when --labels is given.
+
+    Raises: SGAMError when it cannot be made, or OptionError when maps are described that are not given.
+    """
+    if options.label_names and not options.labels:
+        raise OptionError(f"--label-names '{options.label_names}' says how --labels are written; give --labels too")
     segmenter: Segmenter = registry.create(
         "segmenter",
         "labels" if options.labels else options.segmenter,
         folder=options.labels,
         resize=options.resize_labels,
+        label_names=options.label_names,
         device=str(find_device(options.device, "--device")),
         threads=options.threads,
         seed=options.seed,

@@ -1,12 +1,13 @@
 """What the ids of label maps mean: labels.json, beside the maps.
 
-labels.json             see `LabelSet`; its `labels` alone make a folder of maps from elsewhere speak in names
+labels.json             see `LabelSet`; its `labels` or its `names` alone make a folder from elsewhere speak in names
 <image name>.png        ids of 8 or 16 bits, 0 = unknown
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from sgam_sfm.images import ImageFile
 from sgam_sfm.nearest import did_you_mean
 
 RECORD = "labels.json"
+_MERGED = re.compile(r"(-other)?(-merged)?$")  # COCO's sky is `sky-other` or `sky-other-merged`
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -35,12 +37,14 @@ class Label:
 class LabelSet:
     """The content of labels.json; in one written by hand, everything but `labels` may be left out.
 
-    segmenter: who made the maps. labels: those that occur. void: the id of pixels without a label. ignored: ids that
-    form no areas. failed: images without a map, and why. facts: what the segmenter reports of itself.
+    segmenter: who made the maps. names: how ids are written and what they mean, as `--label-names` says it. labels:
+    those that occur. void: the id of pixels without a label. ignored: ids that form no areas. failed: images without a
+    map, and why. facts: what the segmenter reports of itself.
     """
 
     version: int = 1
     segmenter: str = "labels"
+    names: str = ""
     void: int = 0
     labels: tuple[Label, ...] = ()
     ignored: tuple[int, ...] = ()
@@ -48,9 +52,20 @@ class LabelSet:
     facts: Mapping[str, object] = field(default_factory=dict)
 
     @property
-    def names(self) -> dict[str, int]:
-        """Ids by name, in lower case."""
-        return {label.name.lower(): label.id for label in self.labels if label.name}
+    def by_name(self) -> dict[str, tuple[int, ...]]:
+        """Ids by name, in lower case.
+
+        `building` also means `building, edifice`, and `sky` also `sky-other-merged`, unless a label is called just so.
+        """
+        whole: dict[str, tuple[int, ...]] = {}
+        short: dict[str, tuple[int, ...]] = {}
+        for label in self.labels:
+            if label.name:
+                name = label.name.strip().lower()
+                whole[name] = (*whole.get(name, ()), label.id)
+                for part in {_MERGED.sub("", part.strip()) for part in name.split(",")} - {""}:
+                    short[part] = (*short.get(part, ()), label.id)
+        return short | whole
 
     def ids(self, wanted: str, flag: str) -> tuple[int, ...]:
         """The ids of a comma-separated list of names and ids.
@@ -58,23 +73,28 @@ class LabelSet:
         Args: flag: the option that holds the list, for messages.
         Raises: OptionError for a name that no label has, with the nearest one.
         """
-        return tuple(self._id(text.strip(), flag) for text in wanted.split(",") if text.strip())
+        return tuple(found for text in wanted.split(",") if text.strip() for found in self._ids(text.strip(), flag))
 
-    def _id(self, text: str, flag: str) -> int:
-        if text.lower() in self.names:
-            return self.names[text.lower()]
+    def _ids(self, text: str, flag: str) -> Iterator[int]:
+        by_name = self.by_name
+        if text.lower() in by_name:
+            yield from by_name[text.lower()]
+            return
         ids = sorted(label.id for label in self.labels)
         known = f" from {ids[0]} to {ids[-1]}" if ids else ""
         if text.isdecimal():
             if ids and int(text) not in ids:
                 raise OptionError(f"{flag} '{text}' is no label; ids are{known}, see labels.json")
-            return int(text)
+            yield int(text)
+            return
         if all(part.isdecimal() for part in text.split()):
             raise OptionError(f"{flag} '{text}': separate labels by commas, '{','.join(text.split())}'")
-        if not self.names:
-            raise OptionError(f"{flag} '{text}': labels of '{self.segmenter}' have no names; give ids{known}")
-        hint = did_you_mean(text.lower(), self.names)
-        raise OptionError(f"{flag} '{text}' is no label; {hint}known: {', '.join(sorted(self.names))}")
+        if not by_name:
+            hint = ", or --label-names what they are" if self.segmenter == "labels" else ""
+            raise OptionError(f"{flag} '{text}': labels of '{self.segmenter}' have no names; give ids{known}{hint}")
+        near = did_you_mean(text.lower(), by_name)
+        listed = ", ".join(sorted({label.name.strip().lower() for label in self.labels if label.name}))
+        raise OptionError(f"{flag} '{text}' is no label; {near}known: {listed}")
 
 
 def read_label_set(folder: Path) -> LabelSet:

@@ -40,8 +40,8 @@ class CachedMatcher:
     @staticmethod
     def of(options: MatchOptions, inputs: Inputs, folder: Path) -> CachedMatcher:
         """The point matcher of the options, for these images."""
-        labels = (options.mask_matches, options.labels, options.segmenter, options.num_labels, options.seed)
-        masks = (options.mask_path, *(labels if options.mask_matches else ()))
+        labels = (options.mask_matches, options.labels, options.label_names, options.segmenter, options.num_labels)
+        masks = (options.mask_path, *((*labels, options.seed) if options.mask_matches else ()))
         key = repr((options.matcher, options.weights, masks))
         return CachedMatcher(create_matcher(options), inputs.digests, key, folder)
 

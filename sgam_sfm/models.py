@@ -17,6 +17,7 @@ from typing import Literal
 
 from sgam_core.errors import OptionError, WeightsError
 from sgam_sfm import registry
+from sgam_sfm.hub import download, in_cache
 from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.weights import (
     ADE20K,
@@ -48,8 +49,9 @@ class ModelCard:
     """What a user may want to know before running a model.
 
     kind: the option that takes the name. code: licence of its code. commercial: whether code and weights may be used
-    commercially; with `no` the licence must be accepted by name. weights: its files. modules: optional dependencies
-    that it needs, by import name.
+    commercially; with `no` the licence must be accepted by name. weights: its files. hub, hub_licence: the model of the
+    Hugging Face hub that it takes them from in place of files. modules: optional dependencies that it needs, by import
+    name. note: what stands for the place of weights where there are none.
     """
 
     name: str
@@ -57,7 +59,10 @@ class ModelCard:
     code: str = OURS
     commercial: Literal["yes", "no", "unknown"] = "yes"
     weights: tuple[WeightsSpec, ...] = ()
+    hub: str = ""
+    hub_licence: str = ""
     modules: tuple[str, ...] = ()
+    note: str = "needs no weights"
 
 
 CARDS = (
@@ -71,8 +76,23 @@ CARDS = (
     ModelCard(name="sift", kind="matcher"),
     ModelCard(name="sift-lightglue", kind="matcher", weights=(SIFT_LIGHTGLUE,)),
     ModelCard(name="superpoint-lightglue", kind="matcher", commercial="no", weights=(SUPERPOINT, SUPERPOINT_LIGHTGLUE)),
+    ModelCard(
+        name="efficient-loftr",
+        kind="matcher",
+        hub="zju-community/efficientloftr",
+        hub_licence="Apache-2.0 (trained on MegaDepth)",
+        modules=("transformers",),
+    ),
     ModelCard(name="coseg", kind="segmenter", weights=(DINOV2_FOCUS,)),
     ModelCard(name="ade20k", kind="segmenter", weights=(ADE20K,), modules=("ai_edge_litert",)),
+    ModelCard(
+        name="hf",
+        kind="segmenter",
+        commercial="unknown",
+        hub_licence="the model's own",
+        modules=("transformers",),
+        note="a model of the hub or a folder, hf:NAME",
+    ),
     ModelCard(name="labels", kind="segmenter"),
     ModelCard(name="sgam", kind="area-matcher"),
     ModelCard(name="tiles", kind="area-matcher"),
@@ -142,6 +162,10 @@ def get_weights(name: str, source: Path | None = None, accepted: str = "") -> tu
         hint = did_you_mean(name, cards)
         raise OptionError(f"model '{name}' is unknown; {hint}known: {', '.join(cards)}")
     card = cards[name]
+    if card.hub and source is not None:
+        raise OptionError(f"model '{name}' takes a folder as it is: no --from, but `--weights {source}` when it runs")
+    if card.hub:
+        return (download(card.hub, name),)
     if not card.weights:
         raise OptionError(f"model '{name}' has no weights; it is ready as it is")
     require_licence(card.kind, name, accepted)
@@ -257,10 +281,15 @@ def _check_by_loading(card: ModelCard, new: Sequence[WeightsSpec], folder: Path)
 
 def _state(card: ModelCard) -> ModelState:
     missing = [module for module in card.modules if find_spec(module) is None]
-    ready, where, get = True, "needs no weights", ""
+    ready, where, get = True, card.note, ""
     if missing:
         entry = registry.available(card.kind)[card.name]
         ready, where, get = False, f"missing package {', '.join(missing)}", registry.install(entry)
+    elif card.hub:
+        here = in_cache(card.hub)
+        ready, where, get = (
+            (True, str(here), "") if here else (False, "missing weights", f"sgam-sfm models get {card.name}")
+        )
     elif card.weights:
         places = []
         for spec in card.weights:
@@ -283,7 +312,7 @@ def _state(card: ModelCard) -> ModelState:
 
 
 def _weights_licence(card: ModelCard) -> str:
-    return "; ".join(dict.fromkeys(spec.license for spec in card.weights)) or "-"
+    return "; ".join(dict.fromkeys(spec.license for spec in card.weights)) or card.hub_licence or "-"
 
 
 def _plugin(kind: str, name: str) -> ModelState:

@@ -67,13 +67,19 @@ class MatchOptions:
     """sgam: semantic areas. Baselines without labels: tiles, a grid paired by a first match of the whole images;
     covisible, the part that this match shows in both, matched again; none, whole images only."""
     segmenter: str = "coseg"
-    """Who makes label maps: coseg learns regions from the collection itself, without a list of classes; ade20k knows 31
-    by name (sky, person, car, ...)."""
+    """Who makes label maps: coseg learns regions from the collection itself, without a list of classes
+    (coseg:facebook/dinov2-base, or another DINOv2 or DINOv3, with a larger network than the one that is installed);
+    ade20k knows 31 by name (sky, person, car, ...); hf:MODEL is a segmentation model of the Hugging Face hub or a
+    folder with one."""
     num_labels: int = 0
     """Regions that coseg looks for (0: as many as are stable over seeds)."""
     labels: Path | None = None
     """Folder of label maps, <image name>.png with ids of 8 or 16 bits (made by `sgam-sfm segment` or elsewhere); wins
     over --segmenter. Its labels.json, when there is one, gives them names."""
+    label_names: str = ""
+    """How --labels are written and what their ids mean: nyu40, ade20k, coco, coco-stuff, seem, cityscapes,
+    cityscapes-train, kitti360 (cityscapes:instances and kitti360:instances keep instances apart); or a file, ScanNet's
+    scannetv2-labels.combined.tsv (with :nyu40 merged into NYU40) or the JSON of COCO's panoptic maps."""
     resize_labels: bool = False
     """Take label maps of another size than their image, resized to it; otherwise such images count as failed."""
     ignore_labels: str = ""
@@ -163,12 +169,18 @@ class SegmentOptions:
     output: Path
     """Folder for the label maps; made when missing."""
     segmenter: str = "coseg"
-    """Who makes them: coseg learns regions from the collection itself, without a list of classes; ade20k knows 31
-    by name (sky, person, car, ...)."""
+    """Who makes them: coseg learns regions from the collection itself, without a list of classes
+    (coseg:facebook/dinov2-base, or another DINOv2 or DINOv3, with a larger network than the one that is installed);
+    ade20k knows 31 by name (sky, person, car, ...); hf:MODEL is a segmentation model of the Hugging Face hub or a
+    folder with one."""
     num_labels: int = 0
     """Regions that coseg looks for (0: as many as are stable over seeds)."""
     labels: Path | None = None
     """Label maps made elsewhere, to be checked, coloured and drawn; wins over --segmenter."""
+    label_names: str = ""
+    """How --labels are written and what their ids mean: nyu40, ade20k, coco, coco-stuff, seem, cityscapes,
+    cityscapes-train, kitti360 (cityscapes:instances and kitti360:instances keep instances apart); or a file, ScanNet's
+    scannetv2-labels.combined.tsv (with :nyu40 merged into NYU40) or the JSON of COCO's panoptic maps."""
     resize_labels: bool = False
     """Take label maps of another size than their image, resized to it; otherwise such images count as failed."""
     ignore_labels: str = ""

@@ -23,25 +23,35 @@ def available(kind: str) -> dict[str, EntryPoint]:
 
 
 def require(kind: str, name: str) -> EntryPoint:
-    """The entry point of that name. Raises: OptionError, with the nearest name, when there is none."""
-    known = available(kind)
-    if name not in known:
-        hint = did_you_mean(name, known)
+    """The entry point of a name, which may be followed by a colon and the name of one of its models.
+
+    Raises: OptionError, with the nearest name, when there is none.
+    """
+    known, prefix = available(kind), name.partition(":")[0]
+    if prefix not in known:
+        hint = did_you_mean(prefix, known)
         raise OptionError(f"--{kind} '{name}' is unknown; {hint}known: {', '.join(known)}")
-    return known[name]
+    return known[prefix]
 
 
 def create(kind: str, name: str, **settings: Any) -> Any:
-    """Make the model of that name.
+    """Make the model of that name; of `prefix:rest`, `rest` is passed on as the setting `name`.
 
     Of `settings` those are passed on that the model's constructor takes, so that a matcher of a few lines needs no
     constructor at all.
-    Raises: OptionError for an unknown name, with the nearest one, or when a package that it needs is not installed.
+    Raises: OptionError for an unknown name, with the nearest one, for a `rest` that is empty or not taken, or when a
+        package that it needs is not installed.
     """
     entry = require(kind, name)
+    _, colon, rest = name.partition(":")
     try:
         factory = entry.load()
         taken = inspect.signature(factory).parameters
+        if colon and "name" not in taken:
+            raise OptionError(f"--{kind} '{name}': '{entry.name}' is one model; give --{kind} {entry.name}")
+        if colon and not rest:
+            raise OptionError(f"--{kind} '{name}' names no model; give one after the colon: a hub id or a folder")
+        settings |= {"name": rest} if colon else {}
         return factory(**{key: value for key, value in settings.items() if key in taken})
     except ModuleNotFoundError as error:
         raise OptionError(f"--{kind} '{name}' needs the package '{error.name}'; run `{install(entry)}`") from error

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import jaxtyping
 import PIL.Image
 import pytest
 
+from tests.hub_models import save_hub_model
 from tests.paths import DATA
 from tests.room import Room, small_room
 from tests.tutorials import DOCS, follow
+
+# Read when huggingface_hub is imported: tests take no model from the network, and do not wait for one.
+os.environ["HF_HUB_OFFLINE"] = "1"
 
 
 @pytest.fixture(scope="session")
@@ -46,6 +52,11 @@ def splat(tutorial: Path) -> Path:
     """The folder for trainers of Gaussian splatting that the tutorial for them makes of that run."""
     follow(DOCS / "tutorials/splatting.md", tutorial)
     return tutorial / "splat"
+
+
+def hub_model(tmp_path_factory) -> Callable[[str], Path]:
+    """The folder of a tiny model of some kind of the Hugging Face hub's, made once."""
+    return cache(lambda kind: save_hub_model(kind, tmp_path_factory.mktemp(kind)))
 
 
 @pytest.fixture

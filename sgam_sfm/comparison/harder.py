@@ -157,6 +157,7 @@ def cut_collection(cut: Cut, options: MatchOptions, inputs: Inputs, folder: Path
         images=folder / "images",
         mask_path=None if options.mask_path is None else folder / "masks",
         labels=None if options.labels is None else folder / "labels",
+        label_names="",  # the maps there are written in plain ids
         cameras=folder / "cameras.txt" if cameras else None,
         camera_params="",
         # Images of several sizes cannot share the one camera that their folder had.

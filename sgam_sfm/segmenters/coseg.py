@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 _BLOCK = 8  # of 12: the later ones were tuned for saliency and merge what is salient
 _MIN_IMAGE_SIZE = 224  # pixels: at least as many patches as one image needs for clusters
 _SMOOTHING_SIGMA = 1.0  # patches: specks under 0.3 % of an image shrink from 6 % of its area to 1 %
-_NUM_COMPONENTS = 32  # of 384: keeps about 80 % of the variance
+_NUM_COMPONENTS = 32  # of 384 of the installed network: keeps about 80 % of the variance
 _CANDIDATES = (8, 10, 12, 14, 16)  # numbers of labels
 _NUM_RUNS = 5  # of k-means for each candidate
 _TOLERANCE = 0.05  # of agreement between runs: about its own noise; within it more labels, so more areas, are preferred
@@ -43,6 +43,7 @@ class CoSeg:
     centres, interpolated between patches, give each pixel its label, 1..K. All that is drawn at random follows from
     `seed` and the content of the images: their order and their names do not matter.
 
+    name: hub id or folder of a larger DINOv2 or DINOv3 (`sgam_sfm.segmenters.dino_hub`); the installed one when empty.
     weights: an ONNX file in place of the installed one. num_labels: 2..255; None takes the number on which runs of
     k-means agree best. cache_folder: where features are kept between runs. image_size: pixels of the longer side at
     which images enter the network. threads: 0 = as many as there are cores.
@@ -56,6 +57,7 @@ class CoSeg:
     def __init__(
         self,
         *,
+        name: str = "",
         weights: Path | None = None,
         device: str = "cpu",
         seed: int = 0,
@@ -68,11 +70,22 @@ class CoSeg:
             raise OptionError(f"num_labels is {num_labels}; expected 2 to 255, or none to choose it")
         if image_size < _MIN_IMAGE_SIZE:
             raise OptionError(f"image_size is {image_size}; expected at least {_MIN_IMAGE_SIZE} pixels")
-        path = find_weights(DINOV2_FOCUS, weights)
-        self._patch_features = PatchFeatures(path, block=_BLOCK, image_size=image_size, device=device, threads=threads)
-        with path.open("rb") as file:
-            settings = (hashlib.file_digest(file, "sha256").hexdigest(), _BLOCK, image_size, device)
-        self._settings_key = hashlib.sha256(repr((*settings, onnxruntime.__version__)).encode()).hexdigest()[:16]
+        self._patch_features: Callable[[np.ndarray], np.ndarray]
+        settings: tuple[str | int, ...]
+        if name:
+            from sgam_sfm.segmenters.dino_hub import HubPatchFeatures
+
+            self._patch_features = large = HubPatchFeatures(name, image_size=image_size, device=device)
+            settings = (large.digest, image_size, device)
+        else:
+            path = find_weights(DINOV2_FOCUS, weights)
+            self._patch_features = PatchFeatures(
+                path, block=_BLOCK, image_size=image_size, device=device, threads=threads
+            )
+            with path.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            settings = (digest, _BLOCK, image_size, device, onnxruntime.__version__)
+        self._settings_key = hashlib.sha256(repr(settings).encode()).hexdigest()[:16]
         self._cache_folder = cache_folder
         self._seed = seed
         self._num_labels = num_labels

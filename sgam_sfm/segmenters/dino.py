@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import onnx
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped, unused-ignore]
-from jaxtyping import Float16, UInt8
+from jaxtyping import Float16, Float32, UInt8
 from onnx.utils import Extractor
 
 from sgam_core.errors import WeightsError
@@ -36,16 +36,35 @@ class PatchFeatures:
 
     def __call__(self, pixels: UInt8[np.ndarray, "H W 3"]) -> Float16[np.ndarray, "rows columns C"]:
         """Unit-length features (rows, columns, C) on a grid of patches that covers the whole image."""
-        height, width = pixels.shape[:2]
-        scale = self._image_size / max(height, width) / PATCH
-        rows, columns = (max(_MIN_PATCHES, round(side * scale)) for side in (height, width))
-        method = cv2.INTER_AREA if rows * PATCH < height else cv2.INTER_LINEAR
-        resized = cv2.resize(pixels, (columns * PATCH, rows * PATCH), interpolation=method)
-        network_input = ((resized.astype(np.float32) / 255 - _MEAN) / _STD).transpose(2, 0, 1)[None]
+        network_input = in_whole_patches(pixels, self._image_size, PATCH, _MEAN, _STD)
         (tokens,) = self._session.run(None, {self._session.get_inputs()[0].name: network_input})
-        patches = tokens[0, 1:]  # the first token stands for the whole image
-        unit = patches / np.linalg.norm(patches, axis=1, keepdims=True)
-        return unit.reshape(rows, columns, -1).astype(np.float16)
+        return unit_grid(tokens[0, 1:], network_input, PATCH)  # the first token stands for the whole image
+
+
+def in_whole_patches(
+    pixels: UInt8[np.ndarray, "H W 3"],
+    image_size: int,
+    patch: int,
+    mean: Float32[np.ndarray, " 3"],
+    std: Float32[np.ndarray, " 3"],
+) -> Float32[np.ndarray, "1 3 h w"]:
+    """An image as a vision transformer sees it: `image_size` pixels on its longer side, both whole patches."""
+    height, width = pixels.shape[:2]
+    scale = image_size / max(height, width) / patch
+    rows, columns = (max(_MIN_PATCHES, round(side * scale)) for side in (height, width))
+    method = cv2.INTER_AREA if rows * patch < height else cv2.INTER_LINEAR
+    resized = cv2.resize(pixels, (columns * patch, rows * patch), interpolation=method)
+    scaled: np.ndarray = ((resized.astype(np.float32) / 255 - mean) / std).transpose(2, 0, 1)[None]
+    return scaled
+
+
+def unit_grid(
+    tokens: Float32[np.ndarray, "N C"], network_input: Float32[np.ndarray, "1 3 h w"], patch: int
+) -> Float16[np.ndarray, "rows columns C"]:
+    """The tokens of an image's patches at unit length, on their grid."""
+    rows, columns = (side // patch for side in network_input.shape[2:])
+    unit: np.ndarray = tokens / np.linalg.norm(tokens, axis=1, keepdims=True)
+    return unit.reshape(rows, columns, -1).astype(np.float16)
 
 
 def _cut_before(weights: Path, block: int) -> bytes:

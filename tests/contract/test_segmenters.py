@@ -12,9 +12,12 @@ from PIL import Image as PillowImage
 from sgam_core.errors import InputError, WeightsError
 from sgam_sfm.images import ImageFile, inspect_image
 from sgam_sfm.segmenters.protocol import Segmenter
+from tests import hub_models
 from tests.paths import weights_of
 
-SEGMENTERS = sorted(point.name for point in entry_points(group="sgam_sfm.segmenters"))
+HUB = [*(f"hf:{kind}" for kind in hub_models.SEGMENTERS), "coseg:dinov2", "coseg:dinov3"]
+"""Segmenters with a model of the hub: a tiny one of that kind."""
+SEGMENTERS = sorted({point.name for point in entry_points(group="sgam_sfm.segmenters")} - {"hf"}) + HUB
 QUICK: dict[str, dict[str, Any]] = {"coseg": {"image_size": 224, "num_labels": 6}}
 SIZES = {"wide.png": (96, 64), "sub/tall.jpg": (40, 120), "tiny.png": (9, 7), "blank.png": (80, 80)}
 
@@ -41,10 +44,13 @@ def images(folder) -> list[ImageFile]:
 
 
 @pytest.fixture(scope="module", params=SEGMENTERS)
-def segmenter(request, folder) -> Segmenter:
-    (point,) = entry_points(group="sgam_sfm.segmenters", name=request.param)
+def segmenter(request, folder, hub_model) -> Segmenter:
+    name, _, kind = request.param.partition(":")
+    (point,) = entry_points(group="sgam_sfm.segmenters", name=name)
     segmenter_class = point.load()
-    options = {**QUICK.get(request.param, {})}
+    options = {**QUICK.get(name, {})}
+    if kind:
+        options["name"] = str(hub_model(kind))
     if "folder" in inspect.signature(segmenter_class).parameters:
         options["folder"] = folder / "labels"
     if (weights := weights_of(request.param)) is not None:

