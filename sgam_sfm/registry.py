@@ -23,25 +23,35 @@ def available(kind: str) -> dict[str, EntryPoint]:
 
 
 def require(kind: str, name: str) -> EntryPoint:
-    """The entry point of that name. Raises: OptionError, with the nearest name, when there is none."""
+    """The entry point of that name, or of what stands before its colon.
+
+    Raises: OptionError, with the nearest name, when there is none.
+    """
     known = available(kind)
-    if name not in known:
-        hint = did_you_mean(name, known)
-        raise OptionError(f"--{kind} '{name}' is unknown; {hint}known: {', '.join(known)}")
-    return known[name]
+    for each in (name, name.partition(":")[0]):
+        if each in known:
+            return known[each]
+    hint = did_you_mean(name, known)
+    raise OptionError(f"--{kind} '{name}' is unknown; {hint}known: {', '.join(known)}")
 
 
 def create(kind: str, name: str, **settings: Any) -> Any:
     """Make the model of that name.
 
     Of `settings` those are passed on that the model's constructor takes, so that a matcher of a few lines needs no
-    constructor at all.
+    constructor at all. Of a name `prefix:rest`, the model `prefix` takes the rest as its setting `name`.
     Raises: OptionError for an unknown name, with the nearest one, or when a package that it needs is not installed.
     """
     entry = require(kind, name)
+    rest = name.removeprefix(entry.name).removeprefix(":")
     try:
         factory = entry.load()
         taken = inspect.signature(factory).parameters
+        if rest and "name" not in taken:
+            raise OptionError(
+                f"--{kind} '{name}' is unknown; '{entry.name}' has no models by name: leave ':{rest}' out"
+            )
+        settings |= {"name": rest} if rest else {}
         return factory(**{key: value for key, value in settings.items() if key in taken})
     except ModuleNotFoundError as error:
         raise OptionError(f"--{kind} '{name}' needs the package '{error.name}'; run `{install(entry)}`") from error
