@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int32
 from pydantic import TypeAdapter, ValidationError
 
-from sgam_core.errors import StageError, SGAMError
+from sgam_core.errors import SGAMError, StageError
 from sgam_sfm.external import Worker, WorkerCommand
 from sgam_sfm.images import ImageFile, read_image
 from sgam_sfm.label_set import Label, LabelSet

@@ -1,2 +1,1 @@
-"""Scripts that run in other Python environments, and the module they speak through; nothing here is imported by them
-but `sgam_worker`."""
+"""Scripts that run in other Python environments, and `sgam_worker`, the one module that they have of us."""
