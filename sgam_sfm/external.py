@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from io import TextIOWrapper
+from io import BufferedReader, BufferedWriter, TextIOWrapper
 from pathlib import Path
 from threading import Event, Thread, Timer
 from typing import IO, Any, TypeVar
@@ -164,8 +164,8 @@ class Worker:
             return self._process.exchange(header, arrays, seconds)
         except _EndedError as error:
             raise StageError(
-                f"{self._command} {error}, and did so twice for the same {self._command.kind} input; what is done is "
-                f"kept, mend the worker and start the same command again{self._process.told()}"
+                f"{self._command} {error}, and did so twice for the same {'pairs' if 'pairs' in header else 'image'}; "
+                f"what is done is kept: mend the worker, then start the same command again{self._process.told()}"
             ) from error
 
     def _started(self) -> _Process:
@@ -235,8 +235,8 @@ class _Process:
         Raises: _EndedError when none comes, or what comes is none; the process has ended then.
         """
         requests, answers = self._process.stdin, self._process.stdout
-        assert requests is not None
-        assert answers is not None
+        assert isinstance(requests, BufferedWriter)
+        assert isinstance(answers, BufferedReader)
         late = Event()
 
         def stop() -> None:
@@ -275,8 +275,8 @@ class _Process:
 
 
 def _read_log(stream: IO[bytes], lines: deque[str]) -> None:
-    with suppress(ValueError):  # closed at the end
-        for line in TextIOWrapper(stream, encoding="utf-8", errors="replace"):
+    with TextIOWrapper(stream, encoding="utf-8", errors="replace") as text:
+        for line in text:
             _log.info("worker: %s", line.rstrip())
             lines.append(line.rstrip()[:_LINE_LENGTH])
 
@@ -293,7 +293,7 @@ def _end(process: subprocess.Popen, log: Thread) -> None:
     _kill(process)
     process.wait()
     log.join(_SECONDS_TO_END)
-    for stream in (process.stdin, process.stdout, process.stderr):
+    for stream in (process.stdin, process.stdout):
         with suppress(OSError, ValueError):
             if stream is not None:
                 stream.close()

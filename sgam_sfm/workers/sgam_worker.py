@@ -47,8 +47,9 @@ import struct
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from io import BufferedIOBase
 from types import SimpleNamespace
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -64,7 +65,7 @@ class ProtocolError(Exception):
     """What came is no message."""
 
 
-def write_message(stream: IO[bytes], header: Mapping[str, Any], arrays: Sequence[np.ndarray] = ()) -> None:
+def write_message(stream: BufferedIOBase, header: Mapping[str, Any], arrays: Sequence[np.ndarray] = ()) -> None:
     """Send a header and arrays, whose types are among `DTYPES`."""
     arrays = [np.ascontiguousarray(array, dtype=DTYPES[array.dtype.name]) for array in arrays]
     described = [{"dtype": array.dtype.name, "shape": array.shape} for array in arrays]
@@ -76,7 +77,7 @@ def write_message(stream: IO[bytes], header: Mapping[str, Any], arrays: Sequence
     stream.flush()
 
 
-def read_message(stream: IO[bytes]) -> tuple[dict[str, Any], list[np.ndarray]]:
+def read_message(stream: BufferedIOBase) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The header and arrays of the next message.
 
     Raises: EOFError when the stream ends, ProtocolError when what comes is no message.
@@ -99,7 +100,7 @@ def read_message(stream: IO[bytes]) -> tuple[dict[str, Any], list[np.ndarray]]:
     return header, [_read_array(stream, one) for one in described]
 
 
-def _read_array(stream: IO[bytes], described: Any) -> np.ndarray:
+def _read_array(stream: BufferedIOBase, described: Any) -> np.ndarray:
     try:
         dtype, shape = np.dtype(DTYPES[described["dtype"]]), tuple(described["shape"])
         good = len(shape) <= MAX_DIMENSIONS and all(type(length) is int and length >= 0 for length in shape)
@@ -113,12 +114,12 @@ def _read_array(stream: IO[bytes], described: Any) -> np.ndarray:
     if num_bytes > MAX_ARRAY_BYTES:
         raise ProtocolError(f"an array of shape {shape}; at most {MAX_ARRAY_BYTES} bytes are allowed")
     array = np.empty(shape, dtype)
-    if array.size and stream.readinto(array.data.cast("B")) < array.nbytes:  # type: ignore[attr-defined]
+    if array.size and stream.readinto(array.data.cast("B")) < array.nbytes:
         raise EOFError("the stream ends within an array")
     return array
 
 
-def _read(stream: IO[bytes], num_bytes: int) -> bytes:
+def _read(stream: BufferedIOBase, num_bytes: int) -> bytes:
     data = stream.read(num_bytes)
     if len(data) < num_bytes:
         raise EOFError("the stream ends within a message" if data else "the stream has ended")
@@ -166,7 +167,7 @@ def _labels(segment: Callable, header: Mapping[str, Any], images: list[np.ndarra
     return "labels", [labels.astype(np.int32)]
 
 
-_pipes: tuple[IO[bytes], IO[bytes]] | None = None  # of this process, once `_run_script` has taken them
+_pipes: tuple[BufferedIOBase, BufferedIOBase] | None = None  # of this process, once `_run_script` has taken them
 
 
 def _serve(kind: str, load: Callable, about: Mapping[str, Any], answer: Callable) -> None:
@@ -193,7 +194,7 @@ def _serve(kind: str, load: Callable, about: Mapping[str, Any], answer: Callable
         write_message(answers, {"type": type_}, results)
 
 
-def _tell(answers: IO[bytes], error: Exception) -> None:
+def _tell(answers: BufferedIOBase, error: Exception) -> None:
     traceback.print_exc()
     write_message(answers, {"type": "error", "message": f"{type(error).__name__}: {error}"})
 
