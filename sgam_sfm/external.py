@@ -29,7 +29,7 @@ from sgam_sfm.workers import sgam_worker
 from sgam_sfm.workers.sgam_worker import PROTOCOL, ProtocolError, read_message, write_message
 
 _log = logging.getLogger(__name__)
-_LAST_LINES, _LINE_LENGTH = 8, 200
+_LAST_LINES, _LINE_LENGTH = 16, 200
 _NOT_INHERITED = ("PYTHONPATH", "PYTHONHOME")  # they lead to packages of this environment
 _SECONDS_TO_END = 5.0
 
@@ -277,8 +277,9 @@ class _Process:
 def _read_log(stream: IO[bytes], lines: deque[str]) -> None:
     with TextIOWrapper(stream, encoding="utf-8", errors="replace") as text:
         for line in text:
-            _log.info("worker: %s", line.rstrip())
-            lines.append(line.rstrip()[:_LINE_LENGTH])
+            if line.strip():
+                _log.info("worker: %s", line.rstrip())
+                lines.append(line.rstrip()[:_LINE_LENGTH])
 
 
 def _kill(process: subprocess.Popen) -> None:

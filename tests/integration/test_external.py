@@ -3,8 +3,8 @@
 import logging
 import sys
 import textwrap
-import time
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -205,18 +205,19 @@ def test_a_crash_twice_is_told_with_the_last_lines(write, open_matcher):
     assert "in match" in message  # where, by faulthandler
 
 
-def test_a_worker_that_hangs_is_ended_with_all_it_started(write, open_matcher, tmp_path):
+def test_a_worker_that_hangs_is_ended_with_all_it_started(write, open_matcher, tmp_path, caplog):
     script = write(f"""
         def match(pairs):
-            import subprocess
-            child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
-            open({str(tmp_path / "child")!r}, "w").write(str(child.pid))
-            time.sleep(600)
+            if not os.path.exists({str(tmp_path / "child")!r}):
+                import subprocess
+                child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+                open({str(tmp_path / "child")!r}, "w").write(str(child.pid))
+                time.sleep(600)
+            return [([[1, 1]], [[2, 2]], [0.5])]
     """)
-    start = time.perf_counter()
-    message = fails(open_matcher(script, timeout=1.0))
-    assert "did not answer within 1 s (--worker-timeout), and did so twice" in message
-    assert time.perf_counter() - start < 30
+    with caplog.at_level(logging.WARNING):
+        assert len(open_matcher(script, timeout=4.0).match([PAIR])[0]) == 1
+    assert caplog.records[0].message.endswith("did not answer within 4 s (--worker-timeout); it is started again")
     child = int((tmp_path / "child").read_text())
     assert not psutil.pid_exists(child) or psutil.Process(child).status() == psutil.STATUS_ZOMBIE
 
@@ -280,7 +281,7 @@ WRONG = {
     ),
     "lengths": (
         "[(np.zeros((2, 2)), np.zeros((1, 2)), None)]",
-        "of shapes (2, 2), (1, 2), (2,); expected (M, 2), (M, 2)",
+        "points0, points1, scores of shapes (2, 2), (1, 2), (2,)",
     ),
     "nan": (
         "[([[np.nan, 1]], [[1, 1]], None)]",
@@ -328,11 +329,10 @@ def test_a_worker_ends_with_its_matcher(write, open_matcher):
 # Segmenters
 
 
-@pytest.fixture
-def folder(tmp_path) -> Path:
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
     """Two views of the texture."""
-    folder = tmp_path / "images"
-    folder.mkdir()
+    folder = tmp_path_factory.mktemp("images")
     for name, warp in (("view0.png", np.eye(3)), ("view1.png", similarity(1.1, 6, (7.3, -4.6), (160, 120)))):
         PIL.Image.fromarray(view(warp, (320, 240))).save(folder / name)
     return folder
@@ -354,9 +354,8 @@ THIRDS = """
 def test_label_maps_and_names_of_a_segmenter(write, images):
     script = write(THIRDS, 'serve_segmenter(load, labels={1: "left", 300: "right"})')
     with closing(ExternalSegmenter(worker=command(script, "segmenter"))) as segmenter:
-        gone = inspect_image(images[0].path.parent, images[0].name)
-        gone.path.rename(gone.path.with_suffix(".gone"))
-        results = [labels for _, labels in segmenter.segment(images, lambda share: None)]
+        gone = replace(images[0], path=images[0].path.with_name("gone.png"))
+        results = [labels for _, labels in segmenter.segment([gone, images[1]], lambda share: None)]
         assert segmenter.label_set.names == {"left": 1, "right": 300}
     assert "cannot be read" in str(results[0])
     height, width = images[1].height, images[1].width
@@ -404,12 +403,10 @@ def test_a_run_with_two_workers_resumes_only_with_the_same(folder, other_python,
     ]
     assert cli.run(given) == DONE
     assert "left" in (tmp_path / "out/labels/labels.json").read_text()
-    assert cli.run([*given, "--worker-timeout", "99"]) == DONE
     assert starting_options(tmp_path / "out/options.json", None).matcher_script == matcher
     matcher.write_text(SIFT.read_text() + "# another one\n")
     assert cli.run(given) == USAGE
     assert "was begun with other --matcher-script-sha256 (" in capsys.readouterr().err
-    assert cli.run([*given, "--matcher-args", "x"]) == USAGE
 
 
 def test_a_worker_that_gives_up_ends_the_run_and_not_only_its_pairs(folder, write, tmp_path, capsys):
@@ -436,6 +433,9 @@ def test_the_content_of_a_script_is_part_of_the_fingerprint(tmp_path):
     script.write_text("1")
     options = MatchOptions(images=Path(), output=Path(), matcher="external", matcher_script=script)
     before = fingerprint(options)
+    assert fingerprint(replace(options, worker_timeout=9.0)) == before
+    assert fingerprint(replace(options, matcher_args="x")) != before
+    assert fingerprint(replace(options, matcher_python=Path("/other/bin/python"))) != before
     script.write_text("2")
     assert fingerprint(options) != before
 
@@ -450,8 +450,8 @@ def test_vismatch_without_an_environment_tells_how_to_make_it(tmp_path, monkeypa
         create_matcher(options)
     assert str(error.value) == (
         f"--matcher vismatch:sift-nn needs vismatch in an environment of its own, which is not in '{tmp_path}/env'; "
-        f"make it with `python3 -m venv '{tmp_path}/env' && '{tmp_path}/env/bin/python' -m pip install vismatch`, or name "
-        "another one by --matcher-python or SGAM_SFM_VISMATCH"
+        f"make it with `python3 -m venv '{tmp_path}/env' && '{tmp_path}/env/bin/python' -m pip install vismatch`, or "
+        "name another one by --matcher-python or SGAM_SFM_VISMATCH"
     )
 
 
