@@ -248,11 +248,12 @@ class _Process:
         try:
             write_message(requests, header, arrays)
             return read_message(answers)
-        except BaseException as error:  # of any kind: what it still answers is not what is asked next
+        except (EOFError, OSError, ValueError, ProtocolError) as error:
             reason = f"did not answer within {seconds:g} s (--worker-timeout)" if late.is_set() else self._reason(error)
             self.end()
-            if isinstance(error, (EOFError, OSError, ValueError, ProtocolError)):
-                raise _EndedError(reason) from error
+            raise _EndedError(reason) from error
+        except BaseException:  # interrupted: what it still answers is not what is asked next
+            self.end()
             raise
         finally:
             timer.cancel()

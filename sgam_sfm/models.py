@@ -84,10 +84,9 @@ CARDS = (
     ModelCard(name="none", kind="area-matcher"),
 )
 
-_NAVER = "CC BY-NC-SA, Naver's"
 VISMATCH_RESEARCH_ONLY = {
     **dict.fromkeys(("superpoint", "superglue", "gim-lightglue", "omniglue"), "Magic Leap's: research only"),
-    **dict.fromkeys(("duster", "master", "r2d2"), _NAVER),
+    **dict.fromkeys(("duster", "master", "r2d2"), "CC BY-NC-SA, Naver's"),
 }
 """Parts of the names of vismatch's matchers whose weights, or those of their keypoints, forbid commercial use."""
 
@@ -127,7 +126,7 @@ def require_licence(kind: str, name: str, accepted: str) -> None:
     """
     names = [each.strip() for each in accepted.split(",") if each.strip()]
     for each in names:
-        if not any(_research_licence(kind, each) for kind in registry.KINDS):
+        if not any(_research_licence(any_kind, each) for any_kind in registry.KINDS):
             bound = (*(card.name for card in CARDS if card.commercial == "no"), "vismatch:superglue, ...")
             raise OptionError(
                 f"--accept-licence '{each}': no model of that name needs it; those that do: {', '.join(bound)}"

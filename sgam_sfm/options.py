@@ -125,7 +125,7 @@ class MatchOptions:
     threads: int = 0
     """CPU threads (0: all cores)."""
     worker_timeout: float = 600.0
-    """Seconds that a script of --matcher-script or --segmenter-script may take to start, or for a pair or an image."""
+    """Seconds that a script of yours, or vismatch, may take to start, or for a pair or an image."""
     seed: int = 0
     """Seed of everything random."""
     verbose: bool = False
@@ -200,7 +200,7 @@ class SegmentOptions:
     threads: int = 0
     """CPU threads (0: all cores)."""
     worker_timeout: float = 600.0
-    """Seconds that a script of --matcher-script or --segmenter-script may take to start, or for a pair or an image."""
+    """Seconds that the script may take to start, or for an image."""
     seed: int = 0
     """Seed of everything random."""
     verbose: bool = False
@@ -311,8 +311,8 @@ def as_json(options: MatchOptions) -> dict[str, Any]:
             content[option.name] = str(value.absolute())
     for name, digest in _DIGESTS.items():
         script: Path | None = getattr(options, name)
-        if script is not None and script.is_file():  # a missing one is told of where it is started
-            content[digest] = hashlib.sha256(script.read_bytes()).hexdigest()
+        if script is not None:  # a missing one is told of where it is started
+            content[digest] = hashlib.sha256(script.read_bytes()).hexdigest() if script.is_file() else "missing"
     return {VERSION: version("sgam-sfm")} | content
 
 

@@ -28,10 +28,11 @@ def require(kind: str, name: str) -> EntryPoint:
     Raises: OptionError, with the nearest name, when there is none.
     """
     known = available(kind)
-    for each in (name, name.partition(":")[0]):
+    prefix = name.partition(":")[0]
+    for each in (name, prefix):
         if each in known:
             return known[each]
-    hint = did_you_mean(name, known)
+    hint = did_you_mean(prefix, known)
     raise OptionError(f"--{kind} '{name}' is unknown; {hint}known: {', '.join(known)}")
 
 

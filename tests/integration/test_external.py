@@ -440,6 +440,22 @@ def test_the_content_of_a_script_is_part_of_the_fingerprint(tmp_path):
     assert fingerprint(options) != before
 
 
+def test_arguments_are_quoted_as_in_a_shell():
+    options = MatchOptions(images=Path(), output=Path(), matcher="external", matcher_args="a 'b c'")
+    assert WorkerCommand.of(options, "matcher", "external").arguments == ("a", "b c")
+    with pytest.raises(
+        OptionError, match=r"--matcher-args cannot be split \(No closing quotation\); quote as in a shell"
+    ):
+        WorkerCommand.of(replace(options, matcher_args="'a"), "matcher", "external")
+
+
+def test_a_name_after_a_colon_is_for_models_that_take_one():
+    with pytest.raises(OptionError, match="'sift:fine' is unknown; 'sift' has no models by name: leave ':fine' out"):
+        create_matcher(MatchOptions(images=Path(), output=Path(), matcher="sift:fine"))
+    with pytest.raises(OptionError, match="--matcher 'sfit:fine' is unknown; did you mean"):
+        create_matcher(MatchOptions(images=Path(), output=Path(), matcher="sfit:fine"))
+
+
 # vismatch
 
 
