@@ -38,7 +38,7 @@ class ExternalMatcher:
         settings = {"device": device, "weights": None if file is None else str(file), "seed": seed}
         self._worker = Worker(worker, settings)
         origin = self._worker.hello.get("origin")
-        if origin not in _ORIGINS:
+        if not isinstance(origin, str) or origin not in _ORIGINS:
             raise self._worker.unusable(
                 f"says that the origin of its points is {origin!r}; expected 'corner', where the centre of the first "
                 "pixel is (0.5, 0.5), or 'center', where it is (0, 0)"
