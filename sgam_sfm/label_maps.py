@@ -16,6 +16,7 @@ from sgam_core import layout_labels
 from sgam_core.errors import InputError, OptionError
 from sgam_sfm import registry
 from sgam_sfm.colours import distinct_colour
+from sgam_sfm.external import WorkerCommand
 from sgam_sfm.files import replacing, write_json
 from sgam_sfm.images import ImageFile, read_label_map
 from sgam_sfm.label_set import RECORD, Label, LabelSet, at_size_of, read_label_set
@@ -76,6 +77,7 @@ def create_segmenter(options: MatchOptions | SegmentOptions, cache_folder: Path)
         seed=options.seed,
         num_labels=options.num_labels or None,
         cache_folder=cache_folder,
+        worker=WorkerCommand.of(options, "segmenter", options.segmenter),
     )
     return segmenter
 

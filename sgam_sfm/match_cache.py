@@ -14,7 +14,7 @@ from sgam_core import Crop, Matches, PointMatcher
 from sgam_sfm.files import replacing
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.matching import create_matcher
-from sgam_sfm.options import MatchOptions
+from sgam_sfm.options import MatchOptions, as_json
 
 
 @dataclass
@@ -40,9 +40,9 @@ class CachedMatcher:
     @staticmethod
     def of(options: MatchOptions, inputs: Inputs, folder: Path) -> CachedMatcher:
         """The point matcher of the options, for these images."""
-        labels = (options.mask_matches, options.labels, options.label_names, options.segmenter, options.num_labels)
-        masks = (options.mask_path, *((*labels, options.seed) if options.mask_matches else ()))
-        key = repr((options.matcher, options.weights, masks))
+        labels = (options.mask_matches, options.labels, options.label_names, options.num_labels, options.seed, *_model(options, "segmenter"))
+        masks = (options.mask_path, *(labels if options.mask_matches else ()))
+        key = repr((options.weights, *_model(options, "matcher"), masks))
         return CachedMatcher(create_matcher(options), inputs.digests, key, folder)
 
     def start(self) -> None:
@@ -85,6 +85,11 @@ class CachedMatcher:
         sides = [(self.digests[crop.image.name], *crop.key[1:]) for crop in (crop0, crop1)]
         name = hashlib.sha256(repr((self.key, sides)).encode()).hexdigest()[:32]
         return self.folder / name[:2] / f"{name}.npz"
+
+
+def _model(options: MatchOptions, kind: str) -> list[str]:
+    """The options that say which model of a kind it is, and the content of its script."""
+    return [f"{name}={value}" for name, value in as_json(options).items() if name.startswith(kind)]
 
 
 def _write(path: Path, matches: Matches, seconds: float) -> None:

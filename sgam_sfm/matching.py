@@ -9,9 +9,10 @@ from functools import lru_cache
 from typing import Any
 
 from sgam_core import AreaMatcher, Image, PairResult, PointMatcher, WholeImages, match_described
-from sgam_core.errors import SGAMError
+from sgam_core.errors import SGAMError, StageError
 from sgam_sfm import registry
 from sgam_sfm.database import camera_matrix
+from sgam_sfm.external import WorkerCommand
 from sgam_sfm.images import read_image, read_mask
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.label_maps import LabelMaps
@@ -32,7 +33,12 @@ def create_matcher(options: MatchOptions) -> PointMatcher:
     """
     require_licence("matcher", options.matcher, options.accept_licence)
     matcher: PointMatcher = registry.create(
-        "matcher", options.matcher, weights=options.weights, device=options.device, seed=options.seed
+        "matcher",
+        options.matcher,
+        weights=options.weights,
+        device=options.device,
+        seed=options.seed,
+        worker=WorkerCommand.of(options, "matcher", options.matcher),
     )
     return matcher
 
@@ -92,9 +98,14 @@ class CollectionMatcher:
             reset()
 
     def match(self, pair: Pair) -> PairRecord:
-        """The record of one pair; an error of its images becomes part of it."""
+        """The record of one pair; an error of its images becomes part of it.
+
+        Raises: StageError when the point matcher is at its end, and not only this pair.
+        """
         try:
             result = self._match(pair)
+        except StageError:
+            raise
         except SGAMError as error:
             _log.warning("%s - %s: %s", *pair, error)
             return PairRecord(pair=pair, result=None, error=str(error))

@@ -18,6 +18,7 @@ from typing import Literal
 from sgam_core.errors import OptionError, WeightsError
 from sgam_sfm import registry
 from sgam_sfm.hub import download, in_cache
+from sgam_sfm.matchers.vismatch import environment, how_to_make, python_of
 from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.weights import (
     ADE20K,
@@ -83,6 +84,8 @@ CARDS = (
         hub_licence="Apache-2.0 (trained on MegaDepth)",
         modules=("transformers",),
     ),
+    ModelCard(name="vismatch", kind="matcher", code="BSD-3-Clause", commercial="unknown"),
+    ModelCard(name="external", kind="matcher", code=UNKNOWN, commercial="unknown"),
     ModelCard(name="coseg", kind="segmenter", weights=(DINOV2_FOCUS,)),
     ModelCard(name="ade20k", kind="segmenter", weights=(ADE20K,), modules=("ai_edge_litert",)),
     ModelCard(
@@ -94,11 +97,18 @@ CARDS = (
         note="a model of the hub or a folder, hf:NAME",
     ),
     ModelCard(name="labels", kind="segmenter"),
+    ModelCard(name="external", kind="segmenter", code=UNKNOWN, commercial="unknown"),
     ModelCard(name="sgam", kind="area-matcher"),
     ModelCard(name="tiles", kind="area-matcher"),
     ModelCard(name="covisible", kind="area-matcher"),
     ModelCard(name="none", kind="area-matcher"),
 )
+
+VISMATCH_RESEARCH_ONLY = {
+    **dict.fromkeys(("superpoint", "superglue", "gim-lightglue", "omniglue"), "Magic Leap's: research only"),
+    **dict.fromkeys(("duster", "master", "r2d2"), "CC BY-NC-SA, Naver's"),
+}
+"""Parts of the names of vismatch's matchers whose weights, or those of their keypoints, forbid commercial use."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -134,17 +144,28 @@ def require_licence(kind: str, name: str, accepted: str) -> None:
     Args: accepted: names of models, comma-separated.
     Raises: OptionError that names the licence and the flag; also for an accepted name that is no such model.
     """
-    bound = {card.name: card for card in CARDS if card.commercial == "no"}
     names = [each.strip() for each in accepted.split(",") if each.strip()]
     for each in names:
-        if each not in bound:
-            known = ", ".join(bound)
-            raise OptionError(f"--accept-licence '{each}': no model of that name needs it; those that do: {known}")
-    if name in bound and bound[name].kind == kind and name not in names:
+        if not any(_research_licence(any_kind, each) for any_kind in registry.KINDS):
+            bound = (*(card.name for card in CARDS if card.commercial == "no"), "vismatch:superglue, ...")
+            raise OptionError(
+                f"--accept-licence '{each}': no model of that name needs it; those that do: {', '.join(bound)}"
+            )
+    licence = _research_licence(kind, name)
+    if licence and name not in names:
         raise OptionError(
-            f"{kind} '{name}' may not be used commercially (weights: {_weights_licence(bound[name])}); if its "
-            f"licence allows your use, add `--accept-licence {name}`"
+            f"{kind} '{name}' may not be used commercially (weights: {licence}); if its licence allows your use, add "
+            f"`--accept-licence {name}`"
         )
+
+
+def _research_licence(kind: str, name: str) -> str:
+    """The licence of a model that forbids commercial use; empty for others."""
+    prefix, _, rest = name.partition(":")
+    if (kind, prefix) == ("matcher", "vismatch"):
+        return next((licence for part, licence in VISMATCH_RESEARCH_ONLY.items() if part in rest), "")
+    cards = (card for card in CARDS if card.commercial == "no" and (card.kind, card.name) == (kind, name))
+    return next(map(_weights_licence, cards), "")
 
 
 def get_weights(name: str, source: Path | None = None, accepted: str = "") -> tuple[Path, ...]:
@@ -167,7 +188,8 @@ def get_weights(name: str, source: Path | None = None, accepted: str = "") -> tu
     if card.hub:
         return (download(card.hub, name),)
     if not card.weights:
-        raise OptionError(f"model '{name}' has no weights; it is ready as it is")
+        mend = _state(card).get
+        raise OptionError(f"model '{name}' has no weights; " + (f"run `{mend}`" if mend else "it is ready as it is"))
     require_licence(card.kind, name, accepted)
     wanted = [spec for spec in card.weights if not _is_here(spec)] if source is None else _carried(card, source)
     cache = hub_checkpoints()
@@ -299,6 +321,11 @@ def _state(card: ModelCard) -> ModelState:
                 damaged = "delete the file" in str(error)
                 ready, where, get = False, "damaged weights" if damaged else "missing weights", spec.command
         where = ", ".join(places) if ready else where
+    elif card.name == "external":
+        where = f"a script of yours, --{card.kind}-script"
+    elif card.name == "vismatch":
+        ready, where = python_of(environment()).is_file(), f"environment {environment()}"
+        get = "" if ready else how_to_make()
     return ModelState(
         name=card.name,
         kind=card.kind,

@@ -57,12 +57,18 @@ class MatchOptions:
 
     matcher: str = "xfeat-star"
     """Point matcher. Semi-dense: xfeat-star, loftr, coarse-loftr; sparse: sift, aliked-lightglue, disk-lightglue,
-    xfeat-lighterglue; or another that `sgam-sfm models` lists."""
+    xfeat-lighterglue; or another that `sgam-sfm models` lists: vismatch:NAME, external (a script of yours)."""
     weights: Path | None = None
     """File with the point matcher's weights, where it does not find its own; for loftr also outdoor or indoor_new, for
     a matcher of several files their folder."""
     accept_licence: str = ""
     """Models whose licence forbids commercial use and allows yours, comma-separated names: superpoint-lightglue."""
+    matcher_script: Path | None = None
+    """With --matcher external: the Python script that matches, in an environment of its own (docs/workers.md)."""
+    matcher_python: Path | None = None
+    """The Python that runs it, /path/env/bin/python (without: this one)."""
+    matcher_args: str = ""
+    """What the script gets as arguments, quoted as in a shell; also with vismatch:NAME."""
     area_matcher: str = "sgam"
     """sgam: semantic areas. Baselines without labels: tiles, a grid paired by a first match of the whole images;
     covisible, the part that this match shows in both, matched again; none, whole images only."""
@@ -71,6 +77,12 @@ class MatchOptions:
     (coseg:facebook/dinov2-base, or another DINOv2 or DINOv3, with a larger network than the one that is installed);
     ade20k knows 31 by name (sky, person, car, ...); hf:MODEL is a segmentation model of the Hugging Face hub or a
     folder with one."""
+    segmenter_script: Path | None = None
+    """With --segmenter external: the Python script that segments, in an environment of its own (docs/workers.md)."""
+    segmenter_python: Path | None = None
+    """The Python that runs it, /path/env/bin/python (without: this one)."""
+    segmenter_args: str = ""
+    """What the script gets as arguments, quoted as in a shell."""
     num_labels: int = 0
     """Regions that coseg looks for (0: as many as are stable over seeds)."""
     labels: Path | None = None
@@ -118,6 +130,8 @@ class MatchOptions:
     """auto, cpu, cuda, cuda:1, ..."""
     threads: int = 0
     """CPU threads (0: all cores)."""
+    worker_timeout: float = 600.0
+    """Seconds that a script of yours, or vismatch, may take to start, or for a pair or an image."""
     seed: int = 0
     """Seed of everything random."""
     verbose: bool = False
@@ -173,6 +187,12 @@ class SegmentOptions:
     (coseg:facebook/dinov2-base, or another DINOv2 or DINOv3, with a larger network than the one that is installed);
     ade20k knows 31 by name (sky, person, car, ...); hf:MODEL is a segmentation model of the Hugging Face hub or a
     folder with one."""
+    segmenter_script: Path | None = None
+    """With --segmenter external: the Python script that segments, in an environment of its own (docs/workers.md)."""
+    segmenter_python: Path | None = None
+    """The Python that runs it, /path/env/bin/python (without: this one)."""
+    segmenter_args: str = ""
+    """What the script gets as arguments, quoted as in a shell."""
     num_labels: int = 0
     """Regions that coseg looks for (0: as many as are stable over seeds)."""
     labels: Path | None = None
@@ -191,6 +211,8 @@ class SegmentOptions:
     """auto, cpu, cuda, cuda:1, ..."""
     threads: int = 0
     """CPU threads (0: all cores)."""
+    worker_timeout: float = 600.0
+    """Seconds that the script may take to start, or for an image."""
     seed: int = 0
     """Seed of everything random."""
     verbose: bool = False
@@ -198,14 +220,15 @@ class SegmentOptions:
 
 
 NOT_IN_RESULTS = frozenset(
-    {"images", "pairs", "cameras", "rigs", "output", "config", "threads", "verbose", "accept_licence"}
+    {"images", "pairs", "cameras", "rigs", "output", "config", "threads", "verbose", "accept_licence", "worker_timeout"}
     | {"refine_intrinsics", "mapper", "mapping", "keypoints", "database", "append"}
 )
 """Options that the raw results of pairs do not follow from: a run can be continued with others. The images, pairs and
 cameras themselves count, wherever they are."""
 
 VERSION, _FINGERPRINT = "sgam_sfm_version", "fingerprint"
-"""What an options.json holds besides options."""
+_DIGESTS = {"matcher_script": "matcher_script_sha256", "segmenter_script": "segmenter_script_sha256"}
+"""What an options.json holds besides options; of the scripts, their content counts too."""
 
 
 def starting_options(config: Path | None, preset: str | None) -> MatchOptions:
@@ -216,7 +239,8 @@ def starting_options(config: Path | None, preset: str | None) -> MatchOptions:
     content = read_config(config) if config else {}
     _group_crop(content)
     made_by = content.pop(VERSION, version("sgam-sfm"))
-    content.pop(_FINGERPRINT, None)
+    for name in (_FINGERPRINT, *_DIGESTS.values()):
+        content.pop(name, None)
     try:
         options = with_preset(MatchOptions(images=Path(), output=Path()), preset or content.get("preset", "default"))
         changed: MatchOptions = merged(options, content | {"preset": options.preset})
@@ -297,6 +321,10 @@ def as_json(options: MatchOptions) -> dict[str, Any]:
         value = getattr(options, option.name)
         if isinstance(value, Path) and (value.exists() or option.name != "weights"):  # weights may be a name
             content[option.name] = str(value.absolute())
+    for name, digest in _DIGESTS.items():
+        script: Path | None = getattr(options, name)
+        if script is not None:  # a missing one is told of where it is started
+            content[digest] = hashlib.sha256(script.read_bytes()).hexdigest() if script.is_file() else "missing"
     return {VERSION: version("sgam-sfm")} | content
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -54,9 +56,27 @@ def splat(tutorial: Path) -> Path:
     return tutorial / "splat"
 
 
+@pytest.fixture(scope="session")
 def hub_model(tmp_path_factory) -> Callable[[str], Path]:
     """The folder of a tiny model of some kind of the Hugging Face hub's, made once."""
     return cache(lambda kind: save_hub_model(kind, tmp_path_factory.mktemp(kind)))
+
+
+@pytest.fixture(scope="session")
+def other_python(tmp_path_factory) -> Path:
+    """The Python of another environment, which has numpy and OpenCV and nothing else."""
+    folder = tmp_path_factory.mktemp("other") / "env"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
+    python = folder / "bin" / "python"
+    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-compile"]
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run([*install, "numpy", "opencv-python-headless"], env=clean, capture_output=True, text=True)
+    if done.returncode:
+        reason = f"pip cannot install OpenCV into a second environment: {done.stderr[-300:]}"
+        if os.environ.get("SGAM_SFM_REQUIRE_DATA"):
+            pytest.fail(f"{reason}, and SGAM_SFM_REQUIRE_DATA is set")
+        pytest.skip(reason)
+    return python
 
 
 @pytest.fixture

@@ -13,11 +13,14 @@ from sgam_sfm.options import MatchOptions
 
 def run(options: MatchOptions, console: Console) -> int:
     """Match and reconstruct; print the summary."""
+    from sgam_sfm.external import refuse_unused_script
     from sgam_sfm.inputs import refuse_among_images
     from sgam_sfm.progress import Stages
     from sgam_sfm.runner import match_collection
     from sgam_sfm.summary import print_summary
 
+    refuse_unused_script(options, "matcher")
+    refuse_unused_script(options, "segmenter")
     refuse_among_images(options.output, options.images)  # before the log is begun there
     with logging_to(options.output / "log.txt", console, verbose=options.verbose):
         summary = match_collection(options, Stages(console=console))

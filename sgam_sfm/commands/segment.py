@@ -13,9 +13,11 @@ _MAX_LISTED = 32
 
 def run(options: SegmentOptions, console: Console) -> int:
     """Segment; say what was found."""
+    from sgam_sfm.external import refuse_unused_script
     from sgam_sfm.progress import Stages
     from sgam_sfm.segmentation import segment_collection
 
+    refuse_unused_script(options, "segmenter")
     with logging_to(None, console, verbose=options.verbose):
         found = segment_collection(options, Stages(console=console))
     console.print(f"labels     {len(found.labels)}, made by {found.segmenter}: id, name, share of all pixels")

@@ -2,6 +2,8 @@
 
 from functools import cache, partial
 from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from scipy.spatial import cKDTree
 from sgam_core.errors import WeightsError
 from sgam_core.types import Box, Crop, Matches
 from sgam_sfm import models
+from sgam_sfm.external import WorkerCommand
+from sgam_sfm.matchers.vismatch import VARIABLE, environment, how_to_make, python_of
 from sgam_sfm.registry import available, create
 from tests.paths import weights_of
 from tests.textures import similarity, transfer, view, whole
@@ -23,22 +27,37 @@ WARP = similarity(1.1, 6, (7.3, -4.6), (160, 120))
 
 
 @cache
-def _made(name: str, **settings: int):
+def _made(name: str, **settings: Any):
     return create("matcher", name, weights=weights_of(name), max_features=MAX_FEATURES, **settings)
 
 
-@pytest.fixture(params=list(available("matcher")))
+WORKER = Path(__file__).parents[1] / "workers" / "sift_worker.py"
+
+
+def _settings(name: str, request) -> dict[str, Any]:
+    """What a matcher needs besides its defaults."""
+    if name == "vismatch" and not python_of(environment()).is_file():
+        pytest.skip(f"vismatch is not installed; `{how_to_make()}`, or set {VARIABLE}")
+    if name not in ("vismatch", "external"):
+        return {}
+    python = request.getfixturevalue("other_python") if name == "external" else None
+    return {"worker": WorkerCommand(kind="matcher", name=name, python=python, script=WORKER)}
+
+
+@pytest.fixture(params=["vismatch:sift-nn" if name == "vismatch" else name for name in available("matcher")])
 def make(request):
     """Makes one of the matchers. Crops of other content have other names, so that what it keeps serves all tests."""
-    missing = [module for module in CARDS[request.param].modules if find_spec(module) is None]
+    card = CARDS[request.param.partition(":")[0]]
+    settings = _settings(card.name, request)
+    missing = [module for module in card.modules if find_spec(module) is None]
     if missing:
         pytest.skip(f"{request.param}: {', '.join(missing)} is not installed")
     try:
-        _made(request.param)
+        _made(request.param, **settings)
     except WeightsError as error:
         variable = "SGAM_SFM_LOFTR_WEIGHTS" if request.param == "loftr" else "SGAM_SFM_WEIGHTS"
         pytest.skip(f"{request.param}: {error}; or set {variable}")
-    return partial(_made, request.param)
+    return partial(_made, request.param, **settings)
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image as PillowImage
 
 from sgam_core.errors import InputError, WeightsError
+from sgam_sfm.external import WorkerCommand
 from sgam_sfm.images import ImageFile, inspect_image
 from sgam_sfm.segmenters.protocol import Segmenter
 from tests import hub_models
@@ -18,7 +19,11 @@ from tests.paths import weights_of
 HUB = [*(f"hf:{kind}" for kind in hub_models.SEGMENTERS), "coseg:dinov2", "coseg:dinov3"]
 """Segmenters with a model of the hub: a tiny one of that kind."""
 SEGMENTERS = sorted({point.name for point in entry_points(group="sgam_sfm.segmenters")} - {"hf"}) + HUB
-QUICK: dict[str, dict[str, Any]] = {"coseg": {"image_size": 224, "num_labels": 6}}
+WORKER = Path(__file__).parents[1] / "workers" / "brightness_worker.py"
+QUICK: dict[str, dict[str, Any]] = {
+    "coseg": {"image_size": 224, "num_labels": 6},
+    "external": {"worker": WorkerCommand(kind="segmenter", name="external", script=WORKER)},
+}
 SIZES = {"wide.png": (96, 64), "sub/tall.jpg": (40, 120), "tiny.png": (9, 7), "blank.png": (80, 80)}
 
 

@@ -147,8 +147,22 @@ def test_a_licence_that_forbids_commercial_use_is_accepted_by_name(pair_of_toys)
     with pytest.raises(OptionError) as error:
         require_licence("matcher", "xfeat-star", "toy")
     assert str(error.value) == (
-        "--accept-licence 'toy': no model of that name needs it; those that do: toys, superpoint-lightglue"
+        "--accept-licence 'toy': no model of that name needs it; those that do: toys, superpoint-lightglue, "
+        "vismatch:superglue, ..."
     )
+
+
+def test_vismatch_is_ready_where_its_environment_is(tmp_path, monkeypatch):
+    monkeypatch.setenv("SGAM_SFM_VISMATCH", str(tmp_path))
+    (state,) = (state for state in list_models() if state.name == "vismatch")
+    assert (state.ready, state.where) == (False, f"environment {tmp_path}")
+    assert state.get == f"python3 -m venv '{tmp_path}' && '{tmp_path}/bin/python' -m pip install vismatch"
+    with pytest.raises(OptionError, match=r"model 'vismatch' has no weights; run `python3 -m venv "):
+        get_weights("vismatch")
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "python").touch()
+    (state,) = (state for state in list_models() if state.name == "vismatch")
+    assert (state.ready, state.get) == (True, "")
 
 
 def test_a_run_with_superpoint_asks_for_its_licence_before_its_weights(tmp_path):
@@ -172,9 +186,8 @@ def test_states_tell_what_is_here_and_what_is_not():
     assert states["loftr"].where == "missing weights"
     assert states["loftr"].get == "sgam-sfm models get loftr"
     assert states["none"].where == "needs no weights"
-    assert [state.kind for state in list_models()] == sorted(
-        (state.kind for state in states.values()), key=list(registry.KINDS).index
-    )
+    kinds = [state.kind for state in list_models()]
+    assert kinds == sorted(kinds, key=list(registry.KINDS).index)
 
 
 def test_damaged_weights_are_told_from_missing_ones(cache, toy):
