@@ -1,4 +1,4 @@
-"""The command line: which command, its options, and how errors end it."""
+"""The command line: which command, its options, and how errors end it; `sgam_sfm.supervision.main` starts it."""
 
 from __future__ import annotations
 
@@ -60,11 +60,6 @@ _REFUSALS = {
     errno.ENOTDIR: "a file is in the place of a folder; choose another folder",
     errno.EEXIST: "a file is in the place of a folder; choose another folder",
 }
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the command `sgam-sfm`; ends the process with one of the exit codes."""
-    sys.exit(run(sys.argv[1:] if arguments is None else list(arguments)))
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Crop, Matches
-from sgam_sfm.machine import find_device
+from sgam_sfm.machine import find_device, out_of_memory
 from sgam_sfm.matchers.masks import wanted
 from sgam_sfm.matchers.state_dicts import fill
 from sgam_sfm.weights import LOFTR_INDOOR, LOFTR_OUTDOOR, find_weights
@@ -107,7 +107,7 @@ class LoFTR:
             sides = (torch.from_numpy(_frames([pair[side] for pair in pairs])).to(self.device) for side in (0, 1))
             found = self._net(dict(zip(("image0", "image1"), sides, strict=True)))
         except (MemoryError, RuntimeError) as error:
-            if not _is_out_of_memory(error):
+            if not out_of_memory(error):
                 raise
             (w0, h0), (w1, h1) = (crop.size for crop in pairs[0])
             raise OptionError(
@@ -149,12 +149,6 @@ def _frames(crops: Sequence[Crop]) -> np.ndarray:
     for frame, crop in zip(frames, crops, strict=True):
         frame[0, : crop.size[1], : crop.size[0]] = cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY) / np.float32(255)
     return frames
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    # Torch has a type of its own for it on CUDA, and says it in a plain RuntimeError on the CPU.
-    known = isinstance(error, (MemoryError, torch.cuda.OutOfMemoryError))
-    return known or "DefaultCPUAllocator" in str(error) or "out of memory" in str(error)
 
 
 def _find(weights: Path | None) -> Path:
