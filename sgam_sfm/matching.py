@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -54,9 +54,7 @@ def match_blocks(
     what it did before cannot decide how it batches.
     """
     kept = {index for index, block in enumerate(work) if store.has(index, block)}
-    for index in kept:
-        for outcome in read_outcomes(store.path(index)):
-            stages.counts.update(_counted(outcome.error, outcome.fallback))
+    count_outcomes(stages, store, kept)
     done = sum(len(work[index]) for index in kept)
     with stages.stage("Matching pairs", sum(map(len, work)), done) as advance:
         for index, block in enumerate(work):
@@ -73,6 +71,13 @@ def match_blocks(
                 advance(1)
             store.write(index, records)
     return matcher.seconds
+
+
+def count_outcomes(stages: Stages, store: PairStore, blocks: Iterable[int]) -> None:
+    """Count how the pairs of blocks that are done have ended."""
+    for block in blocks:
+        for outcome in read_outcomes(store.path(block)):
+            stages.counts.update(_counted(outcome.error, outcome.fallback))
 
 
 def _counted(error: str, fallback: str) -> tuple[str, ...]:

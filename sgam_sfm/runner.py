@@ -20,7 +20,7 @@ from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import find_device, peak_memory_mb, use_threads
 from sgam_sfm.mapping import MappingOptions, MappingSummary, VerificationOptions, VerificationSummary
-from sgam_sfm.matching import CollectionMatcher, create_area_matcher, create_matcher, match_blocks
+from sgam_sfm.matching import CollectionMatcher, count_outcomes, create_area_matcher, create_matcher, match_blocks
 from sgam_sfm.options import NOT_IN_RESULTS, VERSION, MatchOptions, as_json, fingerprint
 from sgam_sfm.pairs import Pair, blocks
 from sgam_sfm.progress import Stages
@@ -30,7 +30,7 @@ from sgam_sfm.store import PairStore
 from sgam_sfm.summary import summarise_images, summarise_keypoints, summarise_pairs, versions
 
 _log = logging.getLogger(__name__)
-_WITHOUT_EFFECT = frozenset({"output", "config", "threads", "verbose", "accept_licence"})
+_WITHOUT_EFFECT = frozenset({"output", "config", "threads", "verbose", "log_json", "accept_licence"})
 
 KNOWN_CAMERAS = "known_cameras"
 """In inputs.json: the images whose camera the user gave."""
@@ -67,6 +67,7 @@ def _match_collection(
     store = open_store(options, inputs)
     work = blocks(inputs.pairs.pairs, options.block_images)
     if same and (summary := finished(options, store, work)) is not None:
+        count_outcomes(stages, store, range(len(work)))
         if not stages.quiet:
             again = "`sgam-sfm reconstruct` makes the model anew"
             stages.console.print(f"'{output}' is complete, and nothing has changed since; {again}", soft_wrap=True)

@@ -102,6 +102,8 @@ class PairStore:
         Raises: InputError for a file that is damaged, or none of a store.
         """
         path = self.path(block)
+        with _readable(path):
+            _check_digest(path)  # first: on damaged files HDF5's own code can fail in ways that end the process
         with _readable(path), h5py.File(path, "r") as file:
             for index in range(len(file)):
                 record = _read_record(file[str(index)])

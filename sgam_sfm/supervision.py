@@ -30,6 +30,7 @@ from sgam_sfm.exit_codes import ERROR, INTERRUPTED
 _TRIES = 2
 _SECONDS_OF_ONE_STOP = 1.0
 _COMMANDS = ("match",)
+_PROGRAM = "import sys; from sgam_sfm.supervision import child; sys.exit(child(int(sys.argv[1])))"
 # What native code and the system end a process with; others are what users and schedulers stop it with.
 _CRASHES = tuple(
     getattr(signal, name, None) for name in ("SIGKILL", "SIGSEGV", "SIGBUS", "SIGABRT", "SIGILL", "SIGFPE")
@@ -193,8 +194,7 @@ def _run_child(arguments: Sequence[str], ends: Sequence[Crash], forward: _Forwar
     """Returns: the exit code, negative for a signal, and what the child last told it was working on."""
     from_child, to_parent = os.pipe()
     # -P keeps the working directory off the module path: a `random.py` there must not be what the child imports.
-    program = "import sys; from sgam_sfm.supervision import child; sys.exit(child(int(sys.argv[1])))"
-    command = [sys.executable, "-P", "-c", program, str(to_parent)]
+    command = [sys.executable, "-P", "-c", _PROGRAM, str(to_parent)]
     place: dict[str, Any] = {}
     with os.fdopen(from_child, encoding="utf-8") as lines:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=(to_parent,))
