@@ -468,10 +468,11 @@ def copy_database(source: Path, target: Path) -> None:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether an SQLite file has all its pages, as one that was cut short has not."""
+    """Whether a database has all its pages, as one that was cut short has not."""
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
-            return database.execute("PRAGMA quick_check(1)").fetchone() == ("ok",)
+            (num_images,) = database.execute("SELECT COUNT(*) FROM images").fetchone()
+            return num_images > 0 and database.execute("PRAGMA quick_check(1)").fetchone() == ("ok",)
     except sqlite3.Error:
         return False
 
