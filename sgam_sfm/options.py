@@ -208,11 +208,14 @@ def starting_options(config: Path | None, preset: str | None) -> MatchOptions:
     Raises: OptionError for a file that cannot be used, naming it, or an unknown preset.
     """
     content = read_config(config) if config else {}
+    if not isinstance(content.get("crop", {}), dict):
+        raise OptionError(f"--config '{config}': option 'crop' is {content['crop']!r}; expected options by name")
     _group_crop(content)
     made_by = content.pop(VERSION, version("sgam-sfm"))
     content.pop(_FINGERPRINT, None)
     try:
-        options = with_preset(MatchOptions(images=Path(), output=Path()), preset or content.get("preset", "default"))
+        name = preset or content.get("preset", "default")
+        options = with_preset(MatchOptions(images=Path(), output=Path()), name if isinstance(name, str) else repr(name))
         changed: MatchOptions = merged(options, content | {"preset": options.preset})
         return changed
     except OptionError as error:

@@ -142,7 +142,9 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         with path.open("rb") as file:
             start = file.read(2**16)
         if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-            raise InputError(f"the pair list {path} is UTF-16 text (some Windows programs write it); save it as UTF-8")
+            raise InputError(
+                f"the pair list {path} is UTF-16 text, as some Windows programs write it; save it as UTF-8"
+            )
         if b"\0" in start:
             raise InputError(_NO_TEXT.format(path))
         with path.open(encoding="utf-8-sig") as text:
