@@ -33,6 +33,7 @@ from sgam_sfm.scene import demo_views, write_scene
 
 OPTIONS = ("--matcher", "sift", "--image-size", "240", "--area-size", "160", "--block-images", "2", "--no-mapping")
 CUT_SHARE, EARLY_SHARE = 0.25, 0.1
+NOT_CUT = (".lock", "progress.json", "log.txt", "colmap.log")  # written all the time, and read by nobody on resuming
 KINDS = ("all", "all", "supervisor", "worker")
 
 
@@ -140,7 +141,7 @@ def _kill(run: subprocess.Popen, kind: str) -> int:
 
 def _cut_last(output: Path, rng: random.Random) -> str:
     """Cut the file that was written last to a random length. Returns: its name, digits as #."""
-    files = [path for path in output.rglob("*") if path.is_file() and path.name != ".lock"]
+    files = [path for path in output.rglob("*") if path.is_file() and path.name not in NOT_CUT]
     if not files:
         return "none"
     last = max(files, key=lambda path: path.stat().st_mtime)

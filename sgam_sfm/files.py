@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from pydantic_core import to_jsonable_python
+
+_PARTIAL = re.compile(r"\..+\.\d+\.partial(-wal|-shm|-journal)?")
 
 
 @contextmanager
@@ -29,6 +32,15 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def remove_partials(output: Path) -> None:
+    """Remove what a process that was killed left half-written in a run's folder; nobody else may be writing there."""
+    folders = [output, *(output / name for name in ("pairs", "labels", "cache"))]
+    for folder in folders:
+        for path in folder.glob(".*.partial*") if folder == output else folder.rglob(".*.partial*"):
+            if _PARTIAL.fullmatch(path.name):
+                path.unlink(missing_ok=True)
 
 
 def flush(path: Path) -> None:

@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 
 from sgam_core.errors import InputError, SGAMError
 from sgam_sfm import supervision
-from sgam_sfm.files import write_json
+from sgam_sfm.files import remove_partials, write_json
 from sgam_sfm.progress import StageProgress, Stages
 
 _SECONDS_BETWEEN_WRITES = 1.0
@@ -72,6 +72,7 @@ def recording(output: Path, stages: Stages) -> Iterator[RunRecord | None]:
         raise InputError(
             f"another run is working in '{output}'{who}; wait for it, stop it, or choose another --output"
         ) from error
+    remove_partials(output)
     before = _read(path)
     if before is not None and before.seconds_per_step is not None:
         stages.paces = {before.stage: before.seconds_per_step}

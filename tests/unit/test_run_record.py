@@ -120,3 +120,14 @@ def test_a_stop_by_a_scheduler_is_told_by_its_signal(tmp_path):
 )
 def test_durations_for_people(seconds, told):
     assert duration(seconds) == told
+
+
+def test_what_a_killed_process_left_half_written_is_removed(tmp_path):
+    ours = [".database.db.12.partial", ".cameras.db.345.partial-wal", "pairs/.00001.h5.7.partial"]
+    others = ["pairs/00001.h5", ".hidden.partial", "sub/.a.txt.12.partial"]
+    for name in (*ours, *others):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with recording(tmp_path, Stages(quiet=True)):
+        pass
+    assert [(tmp_path / name).exists() for name in (*ours, *others)] == [False] * 3 + [True] * 3
