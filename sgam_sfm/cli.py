@@ -26,6 +26,7 @@ from sgam_sfm.comparison.options import CompareOptions
 from sgam_sfm.evaluation.options import EvaluateOptions
 from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED, MEANINGS, USAGE
 from sgam_sfm.files import disk_is_full
+from sgam_sfm.machine import out_of_memory
 from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.options import MatchOptions, SegmentOptions, starting_options
 from sgam_sfm.pair_lists.options import PairsOptions
@@ -120,6 +121,11 @@ def _explained(error: Exception) -> tuple[str, int]:
     """One line for an error that a user can mend, and its exit code; any other is a mistake of ours: its traceback."""
     if disk_is_full(error):
         return "the disk is full; free some space, then start the same command again", ERROR
+    if out_of_memory(error) and not isinstance(error, SGAMError):
+        return (
+            f"memory does not suffice ({str(error) or type(error).__name__}); lower --image-size or --max-image-size",
+            ERROR,
+        )
     if isinstance(error, SGAMError):
         return str(error), USAGE if isinstance(error, OptionError) else ERROR
     if isinstance(error, OSError) and error.errno in _REFUSALS:

@@ -105,10 +105,13 @@ def child(pipe: int) -> int:
     _state.crashes = tuple(map(_crash, job["crashes"]))
     _state.to_parent = os.fdopen(pipe, "w", encoding="utf-8")
     _stop_cleanly()
+    try:
+        from sgam_sfm.cli import run
 
-    from sgam_sfm.cli import run
-
-    return run(job["arguments"])
+        return run(job["arguments"])
+    except KeyboardInterrupt:  # before the command line could say so
+        _say("stopped; the same command continues where it was")
+        return INTERRUPTED
 
 
 def _crash(told: dict[str, Any]) -> Crash:
@@ -147,7 +150,7 @@ def supervise(arguments: Sequence[str]) -> int:
     """Run a command line in a child process, again when it is ended from outside. Returns: its exit code."""
     ends: list[Crash] = []
     with _forwarding() as forward:
-        while True:
+        while not forward.stopped:
             code, place = _run_child(arguments, ends, forward)
             if forward.stopped and code < 0:
                 return INTERRUPTED
@@ -163,6 +166,7 @@ def supervise(arguments: Sequence[str]) -> int:
                 )
                 return ERROR
             _say(f"the process was {crash.told} at {where}; it is started again")
+    return INTERRUPTED
 
 
 @dataclass

@@ -150,6 +150,16 @@ def test_memory_that_does_not_suffice_once_and_always(folder, tmp_path, monkeypa
     assert set(tries.values()) == {1, 2}
 
 
+def test_memory_that_does_not_suffice_elsewhere_is_one_line(folder, output, monkeypatch, capsys):
+    def write(*arguments: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("sgam_sfm.runner.write_database", write)
+    (output / "database.db").unlink()
+    assert cli.run(arguments(folder, output)) == ERROR
+    assert "error: memory does not suffice (MemoryError); lower --image-size or" in capsys.readouterr().err
+
+
 def test_a_finished_run_says_so_and_does_nothing_again(folder, output, capsys):
     before = {path: path.stat().st_mtime_ns for path in output.rglob("*.h5")}
     assert cli.run([*arguments(folder, output), "--verbose"]) == DONE
