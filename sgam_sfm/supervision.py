@@ -17,10 +17,11 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from types import FrameType
 from typing import IO, Any
 
@@ -150,9 +151,9 @@ def supervise(arguments: Sequence[str]) -> int:
     """Run a command line in a child process, again when it is ended from outside. Returns: its exit code."""
     ends: list[Crash] = []
     with _forwarding() as forward:
-        while not forward.stopped:
+        while not forward.stopped.is_set():
             code, place = _run_child(arguments, ends, forward)
-            if forward.stopped and code < 0:
+            if forward.stopped.is_set() and code < 0:
                 return INTERRUPTED
             if -code not in _CRASHES:
                 return code if code >= 0 else 128 - code
@@ -172,7 +173,7 @@ def supervise(arguments: Sequence[str]) -> int:
 @dataclass
 class _Forward:
     process: subprocess.Popen[bytes] | None = None
-    stopped: bool = False
+    stopped: threading.Event = field(default_factory=threading.Event)
 
 
 @contextmanager
@@ -181,7 +182,7 @@ def _forwarding() -> Iterator[_Forward]:
     forward = _Forward()
 
     def hand_on(number: int, frame: FrameType | None) -> None:
-        forward.stopped = True
+        forward.stopped.set()
         if forward.process is not None:
             forward.process.send_signal(number)
 
