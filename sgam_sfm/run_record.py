@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import socket
 import threading
@@ -23,6 +24,7 @@ from sgam_sfm.progress import StageProgress, Stages
 
 _SECONDS_BETWEEN_WRITES = 1.0
 SECONDS_BETWEEN_BEATS = 10.0
+_log = logging.getLogger(__name__)
 
 State = Literal["running", "done", "stopped", "failed", "killed"]
 
@@ -73,6 +75,9 @@ def recording(output: Path, stages: Stages) -> Iterator[RunRecord | None]:
             f"another run is working in '{output}'{who}; wait for it, stop it, or choose another --output"
         ) from error
     remove_partials(output)
+    for crash in supervision.crashes()[-1:]:
+        where = " - ".join(crash.pair) or crash.stage or "its start"
+        _log.info("the process before this one was %s at %s", crash.told, where)
     before = _read(path)
     if before is not None and before.seconds_per_step is not None:
         stages.paces = {before.stage: before.seconds_per_step}
