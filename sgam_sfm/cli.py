@@ -1,4 +1,4 @@
-"""The command line: which command, its options, and how errors end it."""
+"""The command line: which command, its options, and how errors end it; `sgam_sfm.supervision.main` starts it."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from sgam_sfm.comparison.options import CompareOptions
 from sgam_sfm.evaluation.options import EvaluateOptions
 from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED, MEANINGS, USAGE
 from sgam_sfm.files import disk_is_full
+from sgam_sfm.machine import out_of_memory
 from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.options import MatchOptions, SegmentOptions, starting_options
 from sgam_sfm.pair_lists.options import PairsOptions
@@ -60,11 +61,6 @@ _REFUSALS = {
     errno.ENOTDIR: "a file is in the place of a folder; choose another folder",
     errno.EEXIST: "a file is in the place of a folder; choose another folder",
 }
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the command `sgam-sfm`; ends the process with one of the exit codes."""
-    sys.exit(run(sys.argv[1:] if arguments is None else list(arguments)))
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -125,6 +121,11 @@ def _explained(error: Exception) -> tuple[str, int]:
     """One line for an error that a user can mend, and its exit code; any other is a mistake of ours: its traceback."""
     if disk_is_full(error):
         return "the disk is full; free some space, then start the same command again", ERROR
+    if out_of_memory(error) and not isinstance(error, SGAMError):
+        return (
+            f"memory does not suffice ({str(error) or type(error).__name__}); lower --image-size or --max-image-size",
+            ERROR,
+        )
     if isinstance(error, SGAMError):
         return str(error), USAGE if isinstance(error, OptionError) else ERROR
     if isinstance(error, OSError) and error.errno in _REFUSALS:

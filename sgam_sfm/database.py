@@ -467,6 +467,16 @@ def copy_database(source: Path, target: Path) -> None:
         _copy(source, partial)
 
 
+def is_whole(path: Path) -> bool:
+    """Whether a database has all its pages, as one that was cut short has not."""
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
+            (num_images,) = database.execute("SELECT COUNT(*) FROM images").fetchone()
+            return num_images > 0 and database.execute("PRAGMA quick_check(1)").fetchone() == ("ok",)
+    except sqlite3.Error:
+        return False
+
+
 def _copy(source: Path, target: Path) -> None:
     """Copy an SQLite file with what is still in its journal."""
     if not source.is_file():

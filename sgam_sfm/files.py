@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,23 +14,45 @@ from typing import Any
 
 from pydantic_core import to_jsonable_python
 
+_PARTIAL = re.compile(r"\..+\.\d+\.partial(-wal|-shm|-journal)?")
+
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A path beside `path` to write to; it takes the place of `path` when all went well, and is removed otherwise."""
+def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
+    """A path beside `path` to write to; it takes the place of `path` when all went well, and is removed otherwise.
+
+    Args: durable: wait until the content is on the disk, so that not even a power cut leaves the name with half of it.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield partial
+        if durable:
+            flush(partial)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
 
 
-def write_json(path: Path, content: Any) -> Any:
+def remove_partials(output: Path) -> None:
+    """Remove what a process that was killed left half-written in a run's folder; nobody else may be writing there."""
+    folders = [output, *(output / name for name in ("pairs", "labels", "cache"))]
+    for folder in folders:
+        for path in folder.glob(".*.partial*") if folder == output else folder.rglob(".*.partial*"):
+            if _PARTIAL.fullmatch(path.name):
+                path.unlink(missing_ok=True)
+
+
+def flush(path: Path) -> None:
+    """Wait until a file that was written is on the disk."""
+    with path.open("r+b") as file:
+        os.fsync(file.fileno())
+
+
+def write_json(path: Path, content: Any, *, durable: bool = True) -> Any:
     """Dataclasses, paths and plain values as JSON. Returns: the content as it is read back."""
     text = json.dumps(to_jsonable_python(content), indent=2)
-    with replacing(path) as partial:
+    with replacing(path, durable=durable) as partial:
         partial.write_text(text + "\n", encoding="utf-8")
     return json.loads(text)
 

@@ -6,6 +6,7 @@ import hashlib
 import io
 import os
 import struct
+import threading
 import unicodedata
 import warnings
 import zlib
@@ -43,6 +44,11 @@ _UPRIGHT_TO_STORED = {
 _GREY_STEP = {"L;2": 85, "L;4": 17}
 # Those of the suffixes above: Pillow knows many more, and runs an interpreter on some (EPS).
 _FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "PPM", "TGA", "WEBP", "GIF", "JPEG2000")
+MAX_IMAGE_SIZE = 16384
+"""Pixels of the longer side, beyond which an image is not decoded unless the user wants it: at most 0.8 GB of RGB."""
+_MAX_BYTES_PER_PIXEL = 8  # of a file: 16 bits for each of four channels, not compressed
+_MAX_METADATA = 2**26  # bytes of a file
+_pillow_limit = threading.Lock()
 # All that Pillow's decoders are known to raise on broken files.
 _DECODE_ERRORS = (
     OSError,
@@ -51,6 +57,7 @@ _DECODE_ERRORS = (
     EOFError,
     struct.error,
     zlib.error,
+    PillowImage.DecompressionBombError,
 )
 
 
@@ -92,11 +99,12 @@ def list_images(folder: Path) -> tuple[tuple[str, ...], int]:
     return tuple(sorted(names)), num_others
 
 
-def inspect_image(folder: Path, name: str) -> ImageFile:
+def inspect_image(folder: Path, name: str, max_size: int = MAX_IMAGE_SIZE) -> ImageFile:
     """Decode an image once to know its size, that it is whole, and the digest of its content.
 
-    Raises: InputError when the file is missing, truncated, broken, or of a kind that cannot be decoded, a strip,
-        or its name is too long or cannot be written to a database and a log.
+    Args: max_size: in pixels; an image with a longer side is refused before it is decoded.
+    Raises: InputError when the file is missing, truncated, broken, too large, or of a kind that cannot be decoded, a
+        strip, or its name is too long or cannot be written to a database and a log.
     """
     if printable(name) != name:
         raise InputError(
@@ -117,11 +125,16 @@ def inspect_image(folder: Path, name: str) -> ImageFile:
     if os.path.exists(path) and not os.path.isfile(path):  # a pipe would be waited for
         raise InputError(f"image '{name}' is not a regular file but a folder, pipe or device; remove it")
     try:
+        if path.stat().st_size > _MAX_BYTES_PER_PIXEL * max_size**2 + _MAX_METADATA:
+            raise InputError(
+                f"image '{name}' is a file of {path.stat().st_size / 1e9:.1f} GB, more than any image of "
+                f"--max-image-size {max_size} has; remove it, or raise --max-image-size"
+            )
         data = path.read_bytes()
     except OSError as error:
         remedy = "its permissions" if isinstance(error, PermissionError) else "the name"
         raise InputError(f"image '{name}' cannot be read from '{folder}' ({_reason(error)}); check {remedy}") from error
-    height, width = _rgb(_decode(data, name), name).shape[:2]
+    height, width = _rgb(_decode(data, name, max_size), name).shape[:2]
     if max(height, width) > _MAX_ASPECT * min(height, width):
         raise InputError(
             f"image '{name}' is {width}x{height} (width x height), a strip more than {_MAX_ASPECT} times as long as "
@@ -140,13 +153,15 @@ def printable(name: str) -> str:
     return "".join(repr(c)[1:-1] if unicodedata.category(c) in ("Cc", "Cs") else c for c in name)
 
 
-def read_image(file: ImageFile | Path) -> UInt8[np.ndarray, "H W 3"]:
+def read_image(file: ImageFile | Path, max_size: int = MAX_IMAGE_SIZE) -> UInt8[np.ndarray, "H W 3"]:
     """The pixels of an image, RGB; grey is repeated, alpha dropped, 16 bits reduced to 8.
 
-    Raises: InputError when the file is missing, truncated, broken, or of a kind that cannot be decoded.
+    Args: max_size: of an image that has not been inspected.
+    Raises: InputError when the file is missing, truncated, broken, too large, or of a kind that cannot be decoded.
     """
-    path, name = (file.path, file.name) if isinstance(file, ImageFile) else (file, file.name)
-    return _rgb(_decode(_read(path, "image"), name), name)
+    if isinstance(file, ImageFile):
+        return _rgb(_decode(_read(file.path, "image"), file.name, max(file.width, file.height)), file.name)
+    return _rgb(_decode(_read(file, "image"), file.name, max_size), file.name)
 
 
 def read_mask(mask_folder: Path, image: ImageFile) -> Bool[np.ndarray, "H W"] | None:
@@ -160,7 +175,7 @@ def read_mask(mask_folder: Path, image: ImageFile) -> Bool[np.ndarray, "H W"] | 
         path = mask_folder / image.name
     if not path.exists():
         return None
-    picture = _decode(_read(path, "mask"), str(path))
+    picture = _decode(_read(path, "mask"), str(path), max(image.width, image.height, MAX_IMAGE_SIZE))
     one_channel = picture.mode in ("1", "L", "I", "F") or picture.mode.startswith("I;16")
     mask = np.asarray(picture if one_channel else picture.convert("L")) != 0
     if mask.shape != (image.height, image.width):
@@ -171,12 +186,13 @@ def read_mask(mask_folder: Path, image: ImageFile) -> Bool[np.ndarray, "H W"] | 
     return mask
 
 
-def read_label_map(path: Path) -> Int32[np.ndarray, "H W"]:
+def read_label_map(path: Path, max_size: int = MAX_IMAGE_SIZE) -> Int32[np.ndarray, "H W"]:
     """The ids of a label map: a PNG of one channel, 8 or 16 bits; of a palette PNG the indices, not the colours.
 
-    Raises: InputError when the file is missing or broken, or holds colours in place of ids.
+    Args: max_size: in pixels; a map with a longer side is refused.
+    Raises: InputError when the file is missing, broken or too large, or holds colours in place of ids.
     """
-    picture = _decode(_read(path, "label map"), str(path))
+    picture = _decode(_read(path, "label map"), str(path), max_size)
     if not (picture.mode in ("1", "L", "P", "I") or picture.mode.startswith("I;16")):
         raise InputError(
             f"label map '{path}' has the colours of a picture (mode {picture.mode}); expected one channel of ids, "
@@ -185,12 +201,13 @@ def read_label_map(path: Path) -> Int32[np.ndarray, "H W"]:
     return np.asarray(picture).astype(np.int32) // picture.info.get("grey_step", 1)
 
 
-def read_segments(path: Path) -> Int32[np.ndarray, "H W"]:
+def read_segments(path: Path, max_size: int = MAX_IMAGE_SIZE) -> Int32[np.ndarray, "H W"]:
     """The segment ids of a panoptic PNG as COCO writes them: red + 256 green + 65536 blue.
 
-    Raises: InputError when the file is missing or broken, or has no colours.
+    Args: max_size: in pixels; a map with a longer side is refused.
+    Raises: InputError when the file is missing, broken or too large, or has no colours.
     """
-    picture = _decode(_read(path, "label map"), str(path))
+    picture = _decode(_read(path, "label map"), str(path), max_size)
     if picture.mode not in ("RGB", "RGBA"):
         raise InputError(
             f"label map '{path}' has one channel (mode {picture.mode}); expected a panoptic PNG with ids as red + 256 "
@@ -236,21 +253,25 @@ def _read(path: Path, what: str) -> bytes:
         raise InputError(f"{what} '{path}' cannot be read ({_reason(error)}); check the name") from error
 
 
-def _decode(data: bytes, name: str) -> PillowImage.Image:
+def _decode(data: bytes, name: str, max_size: int = MAX_IMAGE_SIZE) -> PillowImage.Image:
     """The first picture of a file; `info` keeps its format, and what its values are to be divided by to be ids."""
     if not data:
         raise InputError(f"'{name}' is empty (0 bytes); copy it again from its source, or remove it")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about broken metadata and many pixels: neither matters here
-            picture: PillowImage.Image = PillowImage.open(io.BytesIO(data), formats=_FORMATS)
+            picture = _header(data)
+            if max(picture.size) > max_size:
+                raise InputError(
+                    f"'{name}' is {picture.width}x{picture.height} pixels (width x height) and was not decoded; make "
+                    f"it smaller, or raise --max-image-size, which is {max_size}"
+                )
             kind = picture.format
             grey_step = _GREY_STEP.get(_raw_mode(picture), 1)
             orientation = picture.getexif().get(ExifTags.Base.Orientation) if kind == "TIFF" else None
             picture.load()
-    except PillowImage.DecompressionBombError as error:
-        limit = 2 * (PillowImage.MAX_IMAGE_PIXELS or 0) // 10**6
-        raise InputError(f"'{name}' has more than {limit} million pixels; make it smaller, or remove it") from error
+    except MemoryError as error:
+        raise InputError(f"'{name}' does not fit into memory; make it smaller, or lower --max-image-size") from error
     except _DECODE_ERRORS as error:
         if any(mark in data[:1024].lower() for mark in (b"<!doctype html", b"<html")):
             raise InputError(
@@ -264,6 +285,16 @@ def _decode(data: bytes, name: str) -> PillowImage.Image:
         picture = picture.transpose(_UPRIGHT_TO_STORED[orientation])
     picture.info |= {"grey_step": grey_step, "format": kind}
     return picture
+
+
+def _header(data: bytes) -> PillowImage.Image:
+    """A picture that is not decoded yet, of any size: ours is the limit, and Pillow's has no other place."""
+    with _pillow_limit:
+        limit, PillowImage.MAX_IMAGE_PIXELS = PillowImage.MAX_IMAGE_PIXELS, None
+        try:
+            return PillowImage.open(io.BytesIO(data), formats=_FORMATS)
+        finally:
+            PillowImage.MAX_IMAGE_PIXELS = limit
 
 
 def _raw_mode(picture: PillowImage.Image) -> str:

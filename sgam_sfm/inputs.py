@@ -10,7 +10,7 @@ from pathlib import Path
 from sgam_core.errors import InputError, OptionError
 from sgam_sfm.appending import require_no_descriptors
 from sgam_sfm.database import CameraInfo, CameraOptions, import_cameras
-from sgam_sfm.images import ImageFile, image_format, inspect_image, list_images, printable
+from sgam_sfm.images import MAX_IMAGE_SIZE, ImageFile, image_format, inspect_image, list_images, printable
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import PairList, all_pairs, read_pairs
 from sgam_sfm.progress import Stages
@@ -48,7 +48,7 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
     for flag, folder in (("--mask-path", options.mask_path), ("--labels", options.labels)):
         if folder is not None and not folder.is_dir():
             raise InputError(f"{flag} '{folder}' does not exist; give the folder that holds <image name>.png")
-    found = read_images(options.images, options.output, stages)
+    found = read_images(options.images, options.output, stages, options.max_image_size)
     images, failed = found.images, found.failed
     num_listed = len(images) + len(failed)
     _check_any(images, failed, options.images)
@@ -107,9 +107,10 @@ class FoundImages:
     num_other_files: int
 
 
-def read_images(folder: Path, output: Path, stages: Stages) -> FoundImages:
+def read_images(folder: Path, output: Path, stages: Stages, max_size: int = MAX_IMAGE_SIZE) -> FoundImages:
     """Decode every image of a folder once.
 
+    Args: max_size: in pixels; images with a longer side are not decoded, and count as failed.
     Raises: OptionError when results would go into the folder; InputError when it holds no image.
     """
     refuse_among_images(output, folder)
@@ -119,7 +120,7 @@ def read_images(folder: Path, output: Path, stages: Stages) -> FoundImages:
     with stages.stage("Reading images", len(names)) as advance:
         for name in names:
             try:
-                images[name] = inspect_image(folder, name)
+                images[name] = inspect_image(folder, name, max_size)
             except InputError as error:
                 failed[printable(name)] = str(error)
                 _log.warning("%s", error)

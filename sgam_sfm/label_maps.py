@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
@@ -26,6 +27,7 @@ from sgam_sfm.progress import Stages
 from sgam_sfm.segmenters.protocol import Segmenter
 
 _log = logging.getLogger(__name__)
+_PNG_END = b"IEND\xaeB`\x82"
 _MAX_LABELS_OF_IMAGE = 1000  # areas are counted label by label
 
 
@@ -52,11 +54,29 @@ class LabelMaps:
 def make_label_maps(options: MatchOptions, images: Mapping[str, ImageFile], stages: Stages) -> LabelMaps:
     """The label maps of a run in OUT/labels, at the size that areas are described at; made once."""
     folder = options.output / "labels"
-    if not (folder / RECORD).exists():
+    if not _are_whole(folder, images):
         segmenter = create_segmenter(options, options.output / "cache")
         name = "labels" if options.labels else options.segmenter
         write_label_maps(segmenter, name, images, folder, stages, full_size=False)
     return LabelMaps(folder=folder, set=read_label_set(folder))
+
+
+def _are_whole(folder: Path, images: Collection[str]) -> bool:
+    """Whether a run has made its label maps, and the disk has kept all of them."""
+    if not (folder / RECORD).exists():
+        return False
+    try:
+        failed = read_label_set(folder).failed
+        for name in images:
+            if name not in failed:
+                with (folder / f"{name}.png").open("rb") as file:
+                    file.seek(-len(_PNG_END), os.SEEK_END)
+                    if file.read() != _PNG_END:
+                        raise InputError(f"'{file.name}' is cut short")
+    except (OSError, InputError) as error:
+        _log.warning("label maps are damaged (%s), and are made again", error)
+        return False
+    return True
 
 
 def create_segmenter(options: MatchOptions | SegmentOptions, cache_folder: Path) -> Segmenter:

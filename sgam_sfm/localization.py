@@ -151,7 +151,7 @@ def _read_inputs(
     options: LocalizeOptions, results: Results, model: pycolmap.Reconstruction, stages: Stages
 ) -> tuple[Inputs, tuple[str, ...]]:
     """Photos and references as one collection, and the names of the photos that are in a pair."""
-    found = read_images(options.images, options.output, stages)
+    found = read_images(options.images, options.output, stages, options.max_image_size)
     photos, failed = found.images, found.failed
     posed = {image.name: image for image in map(model.image, model.reg_image_ids())}
     _require_usable(options, results, photos, posed)
@@ -180,7 +180,7 @@ def _read_inputs(
     with stages.stage("Reading references", len(references)) as advance:
         images = {name: file for name, file in photos.items() if name in used}
         for name in references:
-            images[name] = inspect_image(results.images, name)
+            images[name] = inspect_image(results.images, name, results.max_image_size)
             advance(1)
     cameras = {name: imported.cameras[name] for name in images if name in photos}
     cameras |= {name: _camera_in_model(posed[name], model) for name in references}

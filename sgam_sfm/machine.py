@@ -50,6 +50,14 @@ def _default_threads() -> tuple[int, int]:
     return torch.get_num_threads(), cv2.getNumThreads()
 
 
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that memory is used up; libraries tell it in their own words."""
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return True
+    words = ("out of memory", "DefaultCPUAllocator", "Failed to allocate memory", "Insufficient memory", "bad_alloc")
+    return isinstance(error, Exception) and any(word in str(error) for word in words)
+
+
 def peak_memory_mb() -> float | None:
     """The most memory this process has held, MB; None where the system does not tell (Windows)."""
     status = Path("/proc/self/status")

@@ -2,8 +2,8 @@
 
 Native code can end a process without an exception (corrupt data, memory). In a child that becomes a `StageError`, and
 everything computed before is still there. The child is this module run as a program: it reads a job as JSON from its
-standard input and writes one JSON object a line, progress and finally the result; what native code prints is appended
-to a log file.
+standard input and writes one JSON object a line, progress and finally the result; it ends when its input is closed.
+What native code prints is appended to a log file.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from statistics import median
 from typing import Any
 
 from sgam_core.errors import InputError, OptionError, StageError
+from sgam_sfm.child import end_with_parent
+from sgam_sfm.files import flush
 from sgam_sfm.machine import peak_memory_mb
 from sgam_sfm.pairs import Pair
 from sgam_sfm.triangulation import require_fitting, triangulated
@@ -245,6 +247,8 @@ def map_images(
             if old.name.isdecimal():
                 shutil.rmtree(old)
         for model in models:
+            for file in (partial / "sorted" / model.folder).iterdir():
+                flush(file)
             (partial / "sorted" / model.folder).rename(output_sparse / model.folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -307,8 +311,9 @@ def _run(job: dict[str, Any], log_path: Path, on_progress: Progress | None) -> t
         assert child.stdin is not None
         assert child.stdout is not None
         try:
-            with suppress(BrokenPipeError), child.stdin:  # a child that ended at once is told by its exit code
-                json.dump(job, child.stdin)
+            with suppress(BrokenPipeError):  # a child that ended at once is told by its exit code
+                child.stdin.write(json.dumps(job) + "\n")
+                child.stdin.flush()  # and left open: the child ends when it is closed
             with child.stdout:
                 for line in child.stdout:
                     message = json.loads(line)
@@ -319,8 +324,11 @@ def _run(job: dict[str, Any], log_path: Path, on_progress: Progress | None) -> t
         finally:
             child.kill()
             child.wait()
+            with suppress(BrokenPipeError):
+                child.stdin.close()
     if code != 0 or result is None:
         ending = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        ending += " (out of memory?)" if ending == "SIGKILL" else ""
         raise StageError(
             f"COLMAP's {job['stage']} ended with {ending}: {_last_words(log_path, log_start)} (log: {log_path}); "
             "everything before this stage has been kept"
@@ -568,7 +576,8 @@ def _main() -> None:
         channel.write(json.dumps(message) + "\n")
         channel.flush()
 
-    job = json.load(sys.stdin)
+    job = json.loads(sys.stdin.buffer.readline())
+    end_with_parent(sys.stdin.fileno())  # it would go on to write into a database that the next run replaces
     stage = {"verification": _verify, "comparison": _compare, "SIFT": _sift}.get(job["stage"], _map)
     result = stage(job, lambda step, done, total: write({"step": step, "done": done, "total": total}))
     write({"result": {**result, "peak_memory_mb": peak_memory_mb()}})

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import time
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,10 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from sgam_core import Crop, Matches, PointMatcher
+from sgam_core.errors import SGAMError
 from sgam_sfm.files import replacing
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.matching import create_matcher
 from sgam_sfm.options import MatchOptions, as_json
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -40,7 +45,14 @@ class CachedMatcher:
     @staticmethod
     def of(options: MatchOptions, inputs: Inputs, folder: Path) -> CachedMatcher:
         """The point matcher of the options, for these images."""
-        labels = (options.mask_matches, options.labels, options.label_names, options.num_labels, options.seed, *_model(options, "segmenter"))
+        labels = (
+            options.mask_matches,
+            options.labels,
+            options.label_names,
+            options.num_labels,
+            options.seed,
+            *_model(options, "segmenter"),
+        )
         masks = (options.mask_path, *(labels if options.mask_matches else ()))
         key = repr((options.weights, *_model(options, "matcher"), masks))
         return CachedMatcher(create_matcher(options), inputs.digests, key, folder)
@@ -66,7 +78,8 @@ class CachedMatcher:
         for pair in pairs:
             self.crops |= {crop.key: crop.size[0] * crop.size[1] for crop in pair}
         paths = [self._path(*pair) for pair in pairs]
-        missing = [row for row, path in enumerate(paths) if not path.exists()]
+        kept = {row: result for row, path in enumerate(paths) if (result := _read(path)) is not None}
+        missing = [row for row in range(len(pairs)) if row not in kept]
         if missing:
             start = time.perf_counter()
             computed = self.matcher.match([pairs[row] for row in missing])
@@ -74,8 +87,9 @@ class CachedMatcher:
             pixels = np.array([sum(crop.size[0] * crop.size[1] for crop in pairs[row]) for row in missing], float)
             for row, matches, share in zip(missing, computed, pixels / pixels.sum(), strict=True):
                 _write(paths[row], matches, seconds * share)
+                kept[row] = (matches, seconds * share)
             self.saved -= seconds
-        found = [_read(path) for path in paths]
+        found = [kept[row] for row in range(len(pairs))]
         cost = sum(seconds for _, seconds in found)
         self.charged += cost
         self.saved += cost
@@ -105,8 +119,15 @@ def _write(path: Path, matches: Matches, seconds: float) -> None:
         )
 
 
-def _read(path: Path) -> tuple[Matches, float]:
-    with np.load(path) as file:
-        content = {name: file[name] for name in file.files}
-    seconds = float(content.pop("seconds"))
-    return Matches(**content), seconds
+def _read(path: Path) -> tuple[Matches, float] | None:
+    """None when there is none, or the disk has damaged it."""
+    try:
+        with path.open("rb") as stored, np.load(stored, allow_pickle=False) as file:
+            content = {name: file[name] for name in file.files}
+        seconds = float(content.pop("seconds"))
+        return Matches(**content), seconds
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, SGAMError) as error:
+        _log.warning("'%s' is damaged (%s), and is matched again", path, error)
+        return None

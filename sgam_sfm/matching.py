@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -16,11 +16,13 @@ from sgam_sfm.external import WorkerCommand
 from sgam_sfm.images import read_image, read_mask
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.label_maps import LabelMaps
+from sgam_sfm.machine import out_of_memory
 from sgam_sfm.models import require_licence
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
 from sgam_sfm.progress import Stages
-from sgam_sfm.store import PairRecord, PairStore
+from sgam_sfm.store import PairRecord, PairStore, read_outcomes
+from sgam_sfm.supervision import given_up
 
 _log = logging.getLogger(__name__)
 _DESCRIPTIONS_IN_MEMORY = 1024  # about 1 MB each
@@ -57,18 +59,43 @@ def match_blocks(
     A block follows from its pairs and the options alone: the point matcher starts each one with empty caches, so that
     what it did before cannot decide how it batches.
     """
-    with stages.stage("Matching pairs", sum(map(len, work))) as advance:
+    kept = {index for index, block in enumerate(work) if store.has(index, block)}
+    count_outcomes(stages, store, kept)
+    done = sum(len(work[index]) for index in kept)
+    with stages.stage("Matching pairs", sum(map(len, work)), done) as advance:
         for index, block in enumerate(work):
-            if store.has(index):
-                advance(len(block))
+            if index in kept:
                 continue
             matcher.start_block()
             records = []
             for pair in block:
-                records.append(matcher.match(pair))
+                stages.working_on(pair)
+                reason = given_up(pair)
+                record = _failed(pair, reason) if reason else matcher.match(pair)
+                records.append(record)
+                stages.counts.update(_counted(record.error, record.result.fallback if record.result else ""))
                 advance(1)
             store.write(index, records)
     return matcher.seconds
+
+
+def count_outcomes(stages: Stages, store: PairStore, blocks: Iterable[int]) -> None:
+    """Count how the pairs of blocks that are done have ended."""
+    for block in blocks:
+        for outcome in read_outcomes(store.path(block)):
+            stages.counts.update(_counted(outcome.error, outcome.fallback))
+
+
+def _counted(error: str, fallback: str) -> tuple[str, ...]:
+    """How a pair ended, in the words of heartbeats."""
+    if error:
+        return ("pairs_failed",)
+    return ("pairs_done", "fallbacks") if fallback else ("pairs_done",)
+
+
+def _failed(pair: Pair, reason: str) -> PairRecord:
+    _log.warning("%s - %s: %s", *pair, reason)
+    return PairRecord(pair=pair, result=None, error=reason)
 
 
 class CollectionMatcher:
@@ -103,15 +130,42 @@ class CollectionMatcher:
         Raises: StageError when the point matcher is at its end, and not only this pair.
         """
         try:
-            result = self._match(pair)
+            result = self._match_within_memory(pair)
         except StageError:
             raise
         except SGAMError as error:
-            _log.warning("%s - %s: %s", *pair, error)
-            return PairRecord(pair=pair, result=None, error=str(error))
+            return _failed(pair, str(error))
         for step, seconds in result.seconds.items():
             self.seconds[step] = self.seconds.get(step, 0.0) + seconds
         return PairRecord(pair=pair, result=result)
+
+    def _match_within_memory(self, pair: Pair) -> PairResult:
+        """Match a pair; once more, with empty caches, when memory does not suffice."""
+        try:
+            return self._match(pair)
+        except Exception as error:
+            if isinstance(error, SGAMError) or not out_of_memory(error):
+                raise
+            _log.warning("%s - %s: memory does not suffice (%s), tried again with empty caches", *pair, error)
+        self._empty_caches()  # here, where the error no longer holds what the attempt had in memory
+        try:
+            return self._match(pair)
+        except Exception as error:
+            if isinstance(error, SGAMError) or not out_of_memory(error):
+                raise
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise StageError(
+                f"memory does not suffice ({reason}); lower --image-size and --area-size, or take another --matcher"
+            ) from error
+
+    def _empty_caches(self) -> None:
+        import torch
+
+        self.start_block()
+        self.image.cache_clear()
+        self._description.cache_clear()
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()
 
     def _match(self, pair: Pair) -> PairResult:
         image0, image1 = (self.image(name) for name in pair)

@@ -124,6 +124,8 @@ class MatchOptions:
     mapping: bool = True
     """Make a model; --no-mapping stops after the geometric verification."""
 
+    max_image_size: int = 16384
+    """Images with a longer side (pixels) are not decoded and count as failed."""
     block_images: int = 8
     """A block of pairs, the unit of work and of resume, joins up to this many images with as many others."""
     device: str = "auto"
@@ -136,6 +138,8 @@ class MatchOptions:
     """Seed of everything random."""
     verbose: bool = False
     """Show the log on the terminal; it is always in OUT/log.txt."""
+    log_json: bool = False
+    """Write the log to OUT/log.jsonl too, a JSON object a line: time, level, logger, message."""
 
     crop: Annotated[CropOptions, tyro.conf.arg(name="")] = field(default_factory=CropOptions)
     """Crops for the point matcher."""
@@ -205,6 +209,8 @@ class SegmentOptions:
     """Take label maps of another size than their image, resized to it; otherwise such images count as failed."""
     ignore_labels: str = ""
     """Labels that are to form no areas, comma-separated names or ids; labels.json keeps them for `match`."""
+    max_image_size: int = 16384
+    """Images with a longer side (pixels) are not decoded and count as failed."""
     overlay_size: int = 1200
     """Long side of an overlay in pixels (0: no overlays)."""
     device: str = "auto"
@@ -220,8 +226,8 @@ class SegmentOptions:
 
 
 NOT_IN_RESULTS = frozenset(
-    {"images", "pairs", "cameras", "rigs", "output", "config", "threads", "verbose", "accept_licence", "worker_timeout"}
-    | {"refine_intrinsics", "mapper", "mapping", "keypoints", "database", "append"}
+    {"images", "pairs", "cameras", "rigs", "output", "config", "threads", "verbose", "log_json", "accept_licence"}
+    | {"refine_intrinsics", "mapper", "mapping", "keypoints", "database", "append", "max_image_size", "worker_timeout"}
 )
 """Options that the raw results of pairs do not follow from: a run can be continued with others. The images, pairs and
 cameras themselves count, wherever they are."""
@@ -237,12 +243,15 @@ def starting_options(config: Path | None, preset: str | None) -> MatchOptions:
     Raises: OptionError for a file that cannot be used, naming it, or an unknown preset.
     """
     content = read_config(config) if config else {}
+    if not isinstance(content.get("crop", {}), dict):
+        raise OptionError(f"--config '{config}': option 'crop' is {content['crop']!r}; expected options by name")
     _group_crop(content)
     made_by = content.pop(VERSION, version("sgam-sfm"))
     for name in (_FINGERPRINT, *_DIGESTS.values()):
         content.pop(name, None)
     try:
-        options = with_preset(MatchOptions(images=Path(), output=Path()), preset or content.get("preset", "default"))
+        name = preset or content.get("preset", "default")
+        options = with_preset(MatchOptions(images=Path(), output=Path()), name if isinstance(name, str) else repr(name))
         changed: MatchOptions = merged(options, content | {"preset": options.preset})
         return changed
     except OptionError as error:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import codecs
 import difflib
-import io
 import posixpath
 import re
 import unicodedata
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -16,6 +15,12 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import numpy as np
 
 from sgam_core.errors import InputError
+
+_MAX_LINE = 2**16  # characters: of two paths, even of comments
+_NO_TEXT = (
+    "the pair list {} is not a text file; expected UTF-8 text with lines of the form 'a.jpg b.jpg' "
+    "(`sgam-sfm pairs from-file` makes one of a COLMAP database or hloc's matches.h5)"
+)
 
 Pair = tuple[str, str]
 """The names of two images, POSIX paths relative to the image folder."""
@@ -48,7 +53,7 @@ def read_pairs(path: Path, names: Sequence[str], unreadable: Collection[str] = (
     Raises: InputError when the file cannot be read, a line does not name two known images, or no pair is left.
     """
     broken = set(unreadable)
-    known = broken.union(names)
+    known = {name: name for name in (*names, *broken)}  # pairs share their names: lists of millions stay small
     pairs: dict[Pair, None] = {}
     set_aside: dict[Pair, None] = {}
     num_repeated = num_reversed = num_self = 0
@@ -131,27 +136,30 @@ def blocks(pairs: Iterable[Pair], images_per_tile: int = 8) -> tuple[tuple[Pair,
     return tuple(tuple(tiles[tile]) for tile in sorted(tiles))
 
 
-def _lines(path: Path) -> list[tuple[int, str]]:
-    """The lines that carry data, with their numbers from 1."""
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """The lines that carry data, with their numbers from 1, one at a time: lists can be longer than memory."""
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            start = file.read(2**16)
+        if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            raise InputError(
+                f"the pair list {path} is UTF-16 text, as some Windows programs write it; save it as UTF-8"
+            )
+        if b"\0" in start:
+            raise InputError(_NO_TEXT.format(path))
+        with path.open(encoding="utf-8-sig") as text:
+            for number, line in enumerate(iter(lambda: text.readline(_MAX_LINE), ""), start=1):
+                if len(line) == _MAX_LINE or "\0" in line:
+                    raise InputError(_NO_TEXT.format(path))
+                stripped = line.strip()
+                if stripped and not stripped.startswith("#"):
+                    yield number, stripped
     except OSError as error:
         raise InputError(
             f"cannot read the pair list {path}: {error.strerror}; give a text file with lines of the form 'a.jpg b.jpg'"
         ) from error
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        raise InputError(f"the pair list {path} is UTF-16 text, as some Windows programs write it; save it as UTF-8")
-    if b"\0" in data:
-        raise InputError(
-            f"the pair list {path} is not a text file; expected UTF-8 text with lines of the form 'a.jpg b.jpg' "
-            "(`sgam-sfm pairs from-file` makes one of a COLMAP database or hloc's matches.h5)"
-        )
-    try:
-        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"the pair list {path} is not UTF-8 text; save it as UTF-8") from error
-    lines = [(number, line.strip()) for number, line in enumerate(io.StringIO(text, newline=None), start=1)]
-    return [(number, line) for number, line in lines if line and not line.startswith("#")]
 
 
 def _is_match(line: str, known: Collection[str]) -> bool:
@@ -160,7 +168,7 @@ def _is_match(line: str, known: Collection[str]) -> bool:
     return len(fields) == 2 and all(field.isdecimal() and field not in known for field in fields)
 
 
-def _pair(line: str, known: Collection[str], where: str) -> Pair:
+def _pair(line: str, known: Mapping[str, str], where: str) -> Pair:
     fields = [field.strip() for field in line.split("\t") if field.strip()] if "\t" in line else line.split()
     if len(fields) != 2:
         raise InputError(
@@ -169,14 +177,14 @@ def _pair(line: str, known: Collection[str], where: str) -> Pair:
     return _known_name(fields[0], known, where), _known_name(fields[1], known, where)
 
 
-def _known_name(name: str, known: Collection[str], where: str) -> str:
+def _known_name(name: str, known: Mapping[str, str], where: str) -> str:
     """The image that a list means by this name, separators and `.` folded."""
     if name in known:
-        return name
+        return known[name]
     slashes = name.replace("\\", "/")
     for other in (PurePosixPath(name).as_posix(), PurePosixPath(slashes).as_posix()):
         if other in known:
-            return other
+            return known[other]
     hint = _hint(name, known)
     shown = re.sub(r"[\x00-\x1f\x7f]", "?", name if len(name) <= 120 else name[:117] + "...")
     if slashes.startswith("/") or PureWindowsPath(name).is_absolute():

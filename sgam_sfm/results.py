@@ -24,7 +24,7 @@ from sgam_sfm.colmap_reading import (
     read_model_names,
     read_pair_inliers,
 )
-from sgam_sfm.images import printable, read_image, read_label_map
+from sgam_sfm.images import MAX_IMAGE_SIZE, printable, read_image, read_label_map
 from sgam_sfm.label_set import read_label_set
 from sgam_sfm.pairs import Pair
 from sgam_sfm.store import PairRecord, PairStore, read_pair_outcomes
@@ -50,6 +50,11 @@ class Results:
     blocks: Mapping[Pair, int]
     errors: Mapping[Pair, str]
     listed: frozenset[Pair]
+
+    @property
+    def max_image_size(self) -> int:
+        """Of the run, pixels of the longer side of an image."""
+        return int(self.options.get("max_image_size", MAX_IMAGE_SIZE))
 
     def require(self, name: str) -> str:
         """The name itself. Raises: InputError, with the nearest name, when no image has it."""
@@ -116,7 +121,7 @@ class Results:
         """
         if not (self.images / name).is_file():
             raise InputError(f"image '{name}' is no longer in '{self.images}'; give its folder with --images DIR")
-        return read_image(self.images / name)
+        return read_image(self.images / name, self.max_image_size)
 
     def labels(self, name: str) -> Int32[np.ndarray, "h w"] | None:
         """The label map of an image, None when the run made none."""

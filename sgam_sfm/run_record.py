@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import socket
+import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -16,10 +18,13 @@ from typing import Literal
 from filelock import FileLock, Timeout
 
 from sgam_core.errors import InputError, SGAMError
-from sgam_sfm.files import write_json
-from sgam_sfm.progress import Stages
+from sgam_sfm import supervision
+from sgam_sfm.files import remove_partials, write_json
+from sgam_sfm.progress import StageProgress, Stages
 
 _SECONDS_BETWEEN_WRITES = 1.0
+SECONDS_BETWEEN_BEATS = 10.0
+_log = logging.getLogger(__name__)
 
 State = Literal["running", "done", "stopped", "failed", "killed"]
 
@@ -29,8 +34,10 @@ class RunRecord:
     """The state of a run.
 
     state: `killed` is never written: it is what a record says that still claims to run when nobody holds its lock.
-    done of total (None: not known): steps of the current stage. eta_seconds: of the stage, None when not known. error:
-    why the run failed. started, updated: UTC, ISO 8601.
+    started: of this process; crashes: how often one before it, of the same run, was ended from outside. updated: the
+    heartbeat, at least every ten seconds while the process lives; times are UTC, ISO 8601. done of total (None: not
+    known): steps of the current stage. pair: what is being matched. eta_seconds, seconds_per_step: of the stage, None
+    when not known. counts: images, images_failed, pairs, pairs_done, pairs_failed, fallbacks. error: why it failed.
     """
 
     state: State
@@ -38,17 +45,22 @@ class RunRecord:
     host: str
     started: str
     updated: str
+    crashes: int = 0
     stage: str = ""
     done: float = 0.0
     total: float | None = None
+    pair: tuple[str, ...] = ()
     eta_seconds: float | None = None
+    seconds_per_step: float | None = None
+    counts: Mapping[str, int] = field(default_factory=dict)
     error: str = ""
 
 
 @contextmanager
-def recording(output: Path, stages: Stages) -> Iterator[None]:
+def recording(output: Path, stages: Stages) -> Iterator[RunRecord | None]:
     """Keep OUT/progress.json up to date while a run lasts.
 
+    Yields: how the last run in OUT ended, None when there was none.
     Raises: InputError when another run is working in OUT.
     """
     output.mkdir(parents=True, exist_ok=True)
@@ -62,24 +74,21 @@ def recording(output: Path, stages: Stages) -> Iterator[None]:
         raise InputError(
             f"another run is working in '{output}'{who}; wait for it, stop it, or choose another --output"
         ) from error
-    now = _now()
-    record = RunRecord(state="running", pid=os.getpid(), host=socket.gethostname(), started=now, updated=now)
-    written = 0.0
-
-    def keep(stage: str, done: float, total: float | None, eta_seconds: float | None) -> None:
-        nonlocal record, written
-        changed = stage != record.stage
-        record = replace(record, stage=stage, done=done, total=total, eta_seconds=eta_seconds, updated=_now())
-        if changed or time.monotonic() - written > _SECONDS_BETWEEN_WRITES:
-            write_json(path, asdict(record))
-            written = time.monotonic()
-
-    stages.listen = keep
+    remove_partials(output)
+    for crash in supervision.crashes()[-1:]:
+        where = " - ".join(crash.pair) or crash.stage or "its start"
+        _log.info("the process before this one was %s at %s", crash.told, where)
+    before = _read(path)
+    if before is not None and before.seconds_per_step is not None:
+        stages.paces = {before.stage: before.seconds_per_step}
+    heart = _Heart(path, stages)
+    stages.listen = heart.listen
     state, reason = "done", ""
     try:
-        yield
-    except KeyboardInterrupt:
-        state, reason = "stopped", "stopped by Ctrl-C"
+        with heart.beating():
+            yield before
+    except KeyboardInterrupt as error:
+        state, reason = "stopped", f"stopped by {error}" if str(error) else "stopped by Ctrl-C"
         raise
     except BaseException as error:
         state, reason = "failed", str(error) if isinstance(error, SGAMError) else f"{type(error).__name__}: {error}"
@@ -87,12 +96,61 @@ def recording(output: Path, stages: Stages) -> Iterator[None]:
     finally:
         stages.listen = None
         try:
-            write_json(path, asdict(record) | {"state": state, "error": reason, "updated": _now(), "eta_seconds": None})
+            last = asdict(heart.record) | {"counts": dict(stages.counts), "updated": _now(), "eta_seconds": None}
+            write_json(path, last | {"state": state, "error": reason})
         except OSError:
             if state == "done":
                 raise  # otherwise what ended the run is the better message
         finally:
             lock.release()
+
+
+class _Heart:
+    """Writes the record when something has changed, at most once a second, and every few seconds when nothing has."""
+
+    def __init__(self, path: Path, stages: Stages) -> None:
+        self._path, self._stages = path, stages
+        now = _now()
+        self.record = RunRecord(
+            state="running",
+            pid=os.getpid(),
+            host=socket.gethostname(),
+            started=now,
+            updated=now,
+            crashes=len(supervision.crashes()),
+        )
+        self._written = 0.0
+        self._writing = threading.Lock()
+
+    def listen(self, progress: StageProgress) -> None:
+        supervision.tell(progress.stage, progress.done, progress.pair)
+        changed = progress.stage != self.record.stage
+        self.record = replace(self.record, **asdict(progress), eta_seconds=progress.eta_seconds)
+        if changed or time.monotonic() - self._written > _SECONDS_BETWEEN_WRITES:
+            self._beat()
+
+    @contextmanager
+    def beating(self) -> Iterator[None]:
+        over = threading.Event()
+
+        def beat() -> None:
+            while not over.wait(SECONDS_BETWEEN_BEATS):
+                with suppress(OSError):  # the run's own files tell of a full disk
+                    self._beat()
+
+        thread = threading.Thread(target=beat, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+    def _beat(self) -> None:
+        with self._writing:
+            self._written = time.monotonic()
+            now = replace(self.record, updated=_now(), counts=dict(self._stages.counts))
+            write_json(self._path, asdict(now), durable=False)
 
 
 def read_run_record(output: Path) -> RunRecord | None:
@@ -114,8 +172,9 @@ def _lock_path(output: Path) -> Path:
 
 def _read(path: Path) -> RunRecord | None:
     try:
-        return RunRecord(**json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return RunRecord(**(content | {"pair": tuple(content.get("pair", ()))}))
+    except (OSError, ValueError, TypeError, AttributeError):
         return None
 
 

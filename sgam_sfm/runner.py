@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,20 +13,24 @@ from sgam_core import PointMatcher
 from sgam_core.errors import OptionError
 from sgam_sfm.appending import Stamp, append_to_database, replace_database, stamp_of
 from sgam_sfm.assembly import build_models, merge_records, verify_pairs
-from sgam_sfm.database import write_database
+from sgam_sfm.database import is_whole, write_database
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import find_device, peak_memory_mb, use_threads
 from sgam_sfm.mapping import MappingOptions, MappingSummary, VerificationOptions, VerificationSummary
-from sgam_sfm.matching import CollectionMatcher, create_area_matcher, create_matcher, match_blocks
+from sgam_sfm.matching import CollectionMatcher, count_outcomes, create_area_matcher, create_matcher, match_blocks
 from sgam_sfm.options import NOT_IN_RESULTS, VERSION, MatchOptions, as_json, fingerprint
-from sgam_sfm.pairs import blocks
+from sgam_sfm.pairs import Pair, blocks
 from sgam_sfm.progress import Stages
+from sgam_sfm.results import json_object
 from sgam_sfm.run_record import recording
 from sgam_sfm.store import PairStore
 from sgam_sfm.summary import summarise_images, summarise_keypoints, summarise_pairs, versions
+
+_log = logging.getLogger(__name__)
+_WITHOUT_EFFECT = frozenset({"output", "config", "threads", "verbose", "log_json", "accept_licence"})
 
 KNOWN_CAMERAS = "known_cameras"
 """In inputs.json: the images whose camera the user gave."""
@@ -40,11 +46,14 @@ def match_collection(
     Returns: the content of OUT/summary.json.
     Raises: SGAMError for what cannot be used at all. Single images and pairs that fail are counted in the summary.
     """
-    with recording(options.output, stages := stages or Stages(quiet=True)):
-        return _match_collection(options, stages, point_matcher)
+    with recording(options.output, stages := stages or Stages(quiet=True)) as before:
+        ended_well = before is not None and before.state == "done"
+        return _match_collection(options, stages, point_matcher, ended_well)
 
 
-def _match_collection(options: MatchOptions, stages: Stages, point_matcher: PointMatcher | None) -> dict[str, Any]:
+def _match_collection(
+    options: MatchOptions, stages: Stages, point_matcher: PointMatcher | None, ended_well: bool
+) -> dict[str, Any]:
     options = replace(options, device=str(find_device(options.device, "--device")))
     use_threads(options.threads)
     point_matcher = point_matcher or create_matcher(options)
@@ -53,9 +62,19 @@ def _match_collection(options: MatchOptions, stages: Stages, point_matcher: Poin
 
     existing = None if options.database is None else _stamp(options.database, output)
     inputs = read_inputs(options, stages)
+    stages.counts.update(images=len(inputs.images), images_failed=len(inputs.failed), pairs=len(inputs.pairs.pairs))
+    same = ended_well and same_options(options)
     store = open_store(options, inputs)
-    labels = make_label_maps(options, inputs.images, stages) if needs_labels else None
     work = blocks(inputs.pairs.pairs, options.block_images)
+    if same and (summary := finished(options, store, work)) is not None:
+        count_outcomes(stages, store, range(len(work)))
+        if not stages.quiet:
+            again = "`sgam-sfm reconstruct` makes the model anew"
+            stages.console.print(f"'{output}' is complete, and nothing has changed since; {again}", soft_wrap=True)
+        return summary
+    (output / "summary.json").unlink(missing_ok=True)  # of a run that this one goes on from
+
+    labels = make_label_maps(options, inputs.images, stages) if needs_labels else None
     matcher = CollectionMatcher(options, inputs, labels, point_matcher)
     steps = match_blocks(work, store, matcher, stages)
 
@@ -87,22 +106,48 @@ def _match_collection(options: MatchOptions, stages: Stages, point_matcher: Poin
     return written
 
 
+def same_options(options: MatchOptions) -> bool:
+    """Whether OUT was made with these very options, those of merging and mapping too."""
+    before = json_object(options.output / "options.json")
+    now = json.loads(json.dumps(as_json(options)))
+    return all(before.get(name) == value for name, value in now.items() if name not in _WITHOUT_EFFECT)
+
+
+def finished(options: MatchOptions, store: PairStore, work: Sequence[Sequence[Pair]]) -> dict[str, Any] | None:
+    """The summary of a run in OUT that ended well and whose results are all still there, None when one is not.
+
+    A run into --database is never finished: what it wrote into may have been changed since.
+    """
+    output = options.output
+    summary = json_object(output / "summary.json")
+    files = ("database.db", "keypoints.h5", *(f"sparse/{model['folder']}" for model in summary.get("models", ())))
+    if not summary or options.database is not None or not all((output / name).exists() for name in files):
+        return None
+    if not is_whole(output / "database.db") or not all(store.has(index, block) for index, block in enumerate(work)):
+        return None
+    _log.info("nothing has changed since this run was finished")
+    return summary
+
+
 def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
     """The store of raw results in OUT, bound to options and inputs, which are written to OUT as JSON.
 
+    An options.json that the disk has damaged is written anew: every block knows its own fingerprint.
     Raises: OptionError when OUT was begun with others, naming them.
     """
     mark = fingerprint(options, images=inputs.digests, pairs=inputs.pairs.pairs, cameras=inputs.cameras)
     path = options.output / "options.json"
     now = as_json(options) | {"fingerprint": mark}
     if path.exists():
-        before = _read_options(path)
+        before = json_object(path)
+        if not before:
+            _log.warning("'%s' is damaged, and is written anew", path)
         if before.get("fingerprint") != mark:
-            if any((options.output / "pairs").glob("*.h5")):
+            if before and any((options.output / "pairs").glob("*.h5")):
                 raise OptionError(
                     f"'{options.output}' was begun with other {difference(before, now)}; choose a new --output folder"
                 )
-            (options.output / "labels" / RECORD).unlink(missing_ok=True)  # nothing is matched yet: begin anew
+            (options.output / "labels" / RECORD).unlink(missing_ok=True)  # they follow from the options too
     write_json(path, now)
     given = sorted(name for name, camera in inputs.cameras.items() if camera.known)
     known = {"images": inputs.digests, "failed": inputs.failed, KNOWN_CAMERAS: given}
@@ -118,14 +163,6 @@ def difference(before: dict[str, Any], now: dict[str, Any]) -> str:
         f"{flag} ({there.get(flag)} there, {value} here)" for flag, value in here.items() if there.get(flag) != value
     ]
     return ", ".join(changed) or "images, pairs or cameras"
-
-
-def _read_options(path: Path) -> dict[str, Any]:
-    try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise OptionError(f"'{path}' is damaged ({error}); choose a new --output folder") from error
-    return content
 
 
 def _flags(options: dict[str, Any], prefix: str = "--") -> dict[str, Any]:

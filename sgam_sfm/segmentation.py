@@ -25,7 +25,7 @@ def segment_collection(options: SegmentOptions, stages: Stages) -> LabelSet:
     """
     use_threads(options.threads)
     segmenter = create_segmenter(options, options.output / "cache")
-    found = read_images(options.images, options.output, stages)
+    found = read_images(options.images, options.output, stages, options.max_image_size)
     if not found.images:
         raise InputError(f"no image in '{options.images}' can be used: {min(found.failed.values())}")
     name = "labels" if options.labels else options.segmenter
@@ -43,6 +43,7 @@ def segment_collection(options: SegmentOptions, stages: Stages) -> LabelSet:
 
 def _write_overlay(image: ImageFile, labels: LabelSet, folder: Path, long_side: int) -> None:
     names = {label.id: label.name for label in labels.labels}
-    picture = draw_labels(read_image(image), read_label_map(folder / f"{image.name}.png"), names, long_side)
+    ids = read_label_map(folder / f"{image.name}.png", max(image.width, image.height))
+    picture = draw_labels(read_image(image), ids, names, long_side)
     with replacing(folder / "overlays" / f"{image.name}.jpg") as partial:
         PIL.Image.fromarray(picture).save(partial, format="JPEG", quality=88)

@@ -117,6 +117,8 @@ class LocalizeOptions:
     """Reprojection error of an inlier, in pixels of the photo."""
     min_inliers: int = 15
     """Points of the model that a pose must agree with."""
+    max_image_size: int = 16384
+    """Photos with a longer side (pixels) are not decoded and count as failed."""
     device: str = "auto"
     """auto, cpu, cuda, cuda:1, ..."""
     threads: int = 0

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from collections import Counter
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from sgam_core.errors import InputError
 from sgam_sfm.run_record import RunRecord, read_run_record
-from sgam_sfm.store import read_pair_outcomes
+from sgam_sfm.store import read_outcomes
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -19,7 +20,9 @@ class RunStatus:
 
     images, pairs: how many there are to work on (None before that is known). failed_images, failed_pairs: and why.
     labels: images that have a label map. pairs_done: matched, with and without areas. fallbacks: pairs matched without
-    areas, by reason. summary: OUT/summary.json of a finished run. next: the command that goes on from here.
+    areas, failures: pairs that failed, both by reason. damaged: files of pairs that are to be matched again. summary:
+    OUT/summary.json of a finished run. next: the command that goes on from here. heartbeat_seconds: since the last sign
+    of life.
     """
 
     run: RunRecord
@@ -29,7 +32,10 @@ class RunStatus:
     pairs: int | None
     pairs_done: int
     failed_pairs: dict[str, str]
+    failures: dict[str, int]
     fallbacks: dict[str, int]
+    damaged: tuple[str, ...]
+    heartbeat_seconds: float
     summary: dict[str, Any] | None
     next: str
 
@@ -50,12 +56,19 @@ def read_status(output: Path) -> RunStatus:
         reasons = (inputs["failed"][name] for name in pair if name in inputs["failed"])
         failed[" - ".join(pair)] = next(reasons, "one of its images cannot be used")
     done = 0
-    for outcome in read_pair_outcomes(output):
-        done += not outcome.error
-        if outcome.error:
-            failed[" - ".join(outcome.pair)] = outcome.error
-        elif outcome.fallback:
-            fallbacks[outcome.fallback.partition(":")[0]] += 1
+    damaged = []
+    for path in sorted((output / "pairs").glob("*.h5")):
+        try:
+            outcomes = read_outcomes(path)
+        except InputError:
+            damaged.append(path.name)
+            continue
+        for outcome in outcomes:
+            done += not outcome.error
+            if outcome.error:
+                failed[" - ".join(outcome.pair)] = outcome.error
+            elif outcome.fallback:
+                fallbacks[outcome.fallback.partition(":")[0]] += 1
     return RunStatus(
         run=run,
         images=len(inputs["images"]) if inputs else None,
@@ -64,6 +77,9 @@ def read_status(output: Path) -> RunStatus:
         pairs=len(inputs["pairs"]) + len(inputs.get("left_out", ())) if inputs else None,
         pairs_done=done,
         failed_pairs=failed,
+        failures=dict(Counter(failed.values()).most_common()),
+        damaged=tuple(damaged),
+        heartbeat_seconds=(datetime.now(UTC) - datetime.fromisoformat(run.updated)).total_seconds(),
         fallbacks=dict(sorted(fallbacks.items())),
         summary=_read_json(output / "summary.json") if run.state == "done" else None,
         next="" if run.state in ("running", "done") else f"sgam-sfm match --config '{output / 'options.json'}'",

@@ -1,8 +1,9 @@
 """Raw pair results on disk, one HDF5 file per block of pairs: the unit of work and of resume.
 
-A block's file appears under its name only when it is whole, so that a block either counts as done or is done again.
+A block's file appears under its name only when it is whole, so that a block either counts as done or is done again. It
+begins with a digest of what follows, so that a block that the disk has damaged is found, and done again too.
 
-    pairs/00000.h5          attributes: fingerprint
+    pairs/00000.h5          user block: SHA-256 of the rest; attributes: fingerprint
       /0, /1, ...           one group a pair, in the block's order
          attributes         name0, name1, error and fallback (empty: none)
          facts              areas, two-view geometry, ... as JSON
@@ -12,9 +13,12 @@ A block's file appears under its name only when it is whole, so that a block eit
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
+import logging
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -25,12 +29,17 @@ from pydantic import TypeAdapter
 from pydantic_core import to_jsonable_python
 
 from sgam_core import AreaMatch, Matches, PairResult, TwoViewModel
-from sgam_core.errors import InputError
+from sgam_core.errors import InputError, SGAMError
 from sgam_sfm.files import replacing
 from sgam_sfm.pairs import Pair
 
 _ARRAYS = tuple(array.name for array in fields(Matches))
 _AREAS = TypeAdapter(tuple[AreaMatch, ...])
+_DIGEST_BLOCK = 512  # bytes before the HDF5 file proper: the smallest user block there is
+_MAX_MATCHES = 10**7  # of a pair: a file made by hand can claim any number in a few bytes
+# What h5py, json and pydantic are known to raise on files that are damaged or made by hand.
+_UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, IndexError, SGAMError)
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -53,34 +62,52 @@ class PairStore:
         """Where a block is kept."""
         return self.folder / f"{block:05d}.h5"
 
-    def has(self, block: int) -> bool:
-        """Whether the block is done under the same fingerprint.
+    def has(self, block: int, pairs: Sequence[Pair] = ()) -> bool:
+        """Whether the block is done under the same fingerprint; one that is damaged is not, which the log tells.
 
+        Args: pairs: what it has to hold, in this order; any when empty.
         Raises: InputError when it was made under another one.
         """
         path = self.path(block)
         if not path.exists():
             return False
-        with h5py.File(path, "r") as file:
-            if file.attrs["fingerprint"] != self.fingerprint:
-                raise InputError(f"'{path}' was made from other images, pairs or options; choose a new --output folder")
-        return True
+        try:
+            _check_digest(path)
+            with h5py.File(path, "r") as file:
+                mark = str(file.attrs["fingerprint"])
+                names = [_names(file[str(index)]) for index in range(len(file))] if pairs else []
+        except _UNREADABLE as error:
+            _log.warning("'%s' is damaged (%s): its pairs are matched again, all others are kept", path, _line(error))
+            return False
+        if mark != self.fingerprint:
+            raise InputError(f"'{path}' was made from other images, pairs or options; choose a new --output folder")
+        return names == [tuple(pair) for pair in pairs]
 
     def write(self, block: int, records: Sequence[PairRecord]) -> None:
         """Keep a whole block."""
         content = io.BytesIO()  # HDF5 ends the process when it closes a file that the disk has no room for
-        with h5py.File(content, "w", track_order=True) as file:
+        with h5py.File(content, "w", track_order=True, userblock_size=_DIGEST_BLOCK) as file:
             file.attrs["fingerprint"] = self.fingerprint
             for index, record in enumerate(records):
                 _write_record(file.create_group(str(index)), record)
+        view = content.getbuffer()
+        digest = hashlib.sha256(view[_DIGEST_BLOCK:]).hexdigest().encode()
+        view[: len(digest)] = digest
         with replacing(self.path(block)) as partial:
-            partial.write_bytes(content.getbuffer())
+            partial.write_bytes(view)
 
     def read(self, block: int) -> Iterator[PairRecord]:
-        """The records of a block, in its order."""
-        with h5py.File(self.path(block), "r") as file:
+        """The records of a block, in its order.
+
+        Raises: InputError for a file that is damaged, or none of a store.
+        """
+        path = self.path(block)
+        with _readable(path):
+            _check_digest(path)  # first: on damaged files HDF5's own code can fail in ways that end the process
+        with _readable(path), h5py.File(path, "r") as file:
             for index in range(len(file)):
-                yield _read_record(file[str(index)])
+                record = _read_record(file[str(index)])
+                yield record
 
     def read_all(self, blocks: int) -> Iterator[PairRecord]:
         """The records of blocks 0, 1, ... in order, one block in memory at a time."""
@@ -117,7 +144,7 @@ def _facts(result: PairResult) -> dict[str, Any]:
 
 
 def _read_record(group: h5py.Group) -> PairRecord:
-    pair = (str(group.attrs["name0"]), str(group.attrs["name1"]))
+    pair = _names(group)
     error = str(group.attrs["error"])
     if error:
         return PairRecord(pair=pair, result=None, error=error)
@@ -128,13 +155,20 @@ def _read_record(group: h5py.Group) -> PairRecord:
     return PairRecord(
         pair=pair,
         result=PairResult(
-            matches=Matches(**{name: group[name][()] for name in _ARRAYS}),
+            matches=Matches(**{name: _array(group[name]) for name in _ARRAYS}),
             areas=_AREAS.validate_python(facts.pop("areas")),
             two_view=two_view,
             fallback=str(group.attrs["fallback"]),
             **(facts | {"notes": tuple(facts["notes"])}),
         ),
     )
+
+
+def _array(data: h5py.Dataset) -> np.ndarray:
+    if data.dtype.kind not in "fiu" or data.ndim > 2 or data.size > 2 * _MAX_MATCHES:
+        raise ValueError(f"{data.name} has shape {data.shape} of {data.dtype}")
+    array: np.ndarray = data[()]
+    return array
 
 
 def read_pairs_of(output: Path) -> Iterator[PairRecord]:
@@ -159,11 +193,46 @@ def read_pair_outcomes(output: Path) -> Iterator[PairOutcome]:
     Raises: InputError for a file that is none of a store.
     """
     for path in sorted((output / "pairs").glob("*.h5")):
-        try:
-            with h5py.File(path, "r") as file:
-                for group in file.values():
-                    name0, name1, error = (str(group.attrs[name]) for name in ("name0", "name1", "error"))
-                    fallback = "" if error else str(group.attrs["fallback"])
-                    yield PairOutcome(pair=(name0, name1), block=int(path.stem), error=error, fallback=fallback)
-        except (OSError, KeyError, ValueError) as reason:
-            raise InputError(f"'{path}' is not a file of pair results; remove it and start the run again") from reason
+        yield from read_outcomes(path)
+
+
+def read_outcomes(path: Path) -> list[PairOutcome]:
+    """How the pairs of a block ended.
+
+    Raises: InputError for a file that is none of a store.
+    """
+    outcomes = []
+    with _readable(path), h5py.File(path, "r") as file:
+        for group in file.values():
+            error = str(group.attrs["error"])
+            fallback = "" if error else str(group.attrs["fallback"])
+            outcomes.append(PairOutcome(pair=_names(group), block=int(path.stem), error=error, fallback=fallback))
+    return outcomes
+
+
+def _names(group: h5py.Group) -> Pair:
+    return str(group.attrs["name0"]), str(group.attrs["name1"])
+
+
+def _check_digest(path: Path) -> None:
+    """Raises: ValueError when a file is not what was written."""
+    with path.open("rb") as file:
+        said = file.read(_DIGEST_BLOCK)[:64]
+        found = hashlib.file_digest(file, "sha256").hexdigest().encode()
+    if said != found:
+        raise ValueError("its content has changed since it was written")
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except _UNREADABLE as error:
+        raise InputError(
+            f"'{path}' is not a file of pair results, or damaged ({_line(error)}); start the run again: its pairs are "
+            "matched again, all others are kept"
+        ) from error
+
+
+def _line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -14,7 +14,7 @@ def run(options: CompareOptions, console: Console) -> int:
     from sgam_sfm.comparison.compare import compare, print_table
     from sgam_sfm.comparison.report import write_report
 
-    with logging_to(options.output / "log.txt", console, verbose=options.verbose):
+    with logging_to(options.output / "log.txt", console, verbose=options.verbose, as_json=options.log_json):
         content = compare(options, console)
     print_table(content, console)
     if options.report:

@@ -37,7 +37,7 @@ def run(options: EvaluateOptions, console: Console) -> int:
     from sgam_sfm.evaluation.evaluate import evaluate
     from sgam_sfm.progress import Stages
 
-    with logging_to(options.output / "log.txt", console, verbose=options.verbose):
+    with logging_to(options.output / "log.txt", console, verbose=options.verbose, as_json=options.log_json):
         content = evaluate(options, Stages(console=console))
     _print(content, console)
     return DONE

@@ -22,7 +22,7 @@ def run(options: MatchOptions, console: Console) -> int:
     refuse_unused_script(options, "matcher")
     refuse_unused_script(options, "segmenter")
     refuse_among_images(options.output, options.images)  # before the log is begun there
-    with logging_to(options.output / "log.txt", console, verbose=options.verbose):
+    with logging_to(options.output / "log.txt", console, verbose=options.verbose, as_json=options.log_json):
         summary = match_collection(options, Stages(console=console))
         print_summary(summary, console)
     return exit_code(summary, options)

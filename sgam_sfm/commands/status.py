@@ -42,13 +42,20 @@ def run(options: StatusOptions, console: Console) -> int:
 
 
 def _lines(status: RunStatus) -> list[tuple[str, str]]:
+    from sgam_sfm.progress import duration
+
     run = status.run
-    state = f"{run.state} since {run.started}" if run.state == "running" else f"{run.state} at {run.updated}"
-    lines = [("state", f"{state} (process {run.pid} on {run.host})" + (f": {run.error}" if run.error else ""))]
+    running = run.state == "running"
+    state = f"{run.state} since {run.started}" if running else f"{run.state} at {run.updated}"
+    beat = f", last sign of life {duration(status.heartbeat_seconds)} ago" if running else ""
+    lines = [("state", f"{state} (process {run.pid} on {run.host}{beat})" + (f": {run.error}" if run.error else ""))]
+    if run.crashes:
+        lines.append(("crashes", f"ended from outside and started again {run.crashes} times (see log.txt)"))
     if run.state != "done" and run.stage:
         amount = f" {run.done:.0f} of {run.total:.0f}" if run.total else ""
-        eta = f", about {run.eta_seconds / 60:.0f} min left of this stage" if run.eta_seconds else ""
-        lines.append(("stage", f"{run.stage}{amount}{eta}"))
+        eta = f", about {duration(run.eta_seconds)} left of this stage" if run.eta_seconds is not None else ""
+        at = f", at {' - '.join(run.pair)}" if run.pair else ""
+        lines.append(("stage", f"{run.stage}{amount}{eta}{at}"))
     if status.images is not None:
         lines.append(("images", f"{status.images} used, {len(status.failed_images)} failed"))
         lines += _reasons(status.failed_images)
@@ -57,7 +64,9 @@ def _lines(status: RunStatus) -> list[tuple[str, str]]:
         lines.append(
             ("pairs", f"{status.pairs_done} of {status.pairs} matched and stored, {len(status.failed_pairs)} failed")
         )
-        lines += _reasons(status.failed_pairs)
+        lines += _by_reason(status)
+        if status.damaged:
+            lines.append(("damaged", f"{', '.join(status.damaged)}: the next run matches these pairs again"))
         if status.fallbacks:
             told = ", ".join(f"{count} {reason}" for reason, count in status.fallbacks.items())
             lines.append(("fallbacks", told))
@@ -72,8 +81,21 @@ def _lines(status: RunStatus) -> list[tuple[str, str]]:
     return lines
 
 
+def _by_reason(status: RunStatus) -> list[tuple[str, str]]:
+    """The pairs that failed: one by name, many by their number."""
+    names = {reason: name for name, reason in status.failed_pairs.items()}
+    return _first(
+        [
+            ("", f"{f'{count} pairs' if count > 1 else names[reason]}: {reason}")
+            for reason, count in status.failures.items()
+        ]
+    )
+
+
 def _reasons(failed: dict[str, str]) -> list[tuple[str, str]]:
-    lines = [("", f"{name}: {reason}") for name, reason in list(failed.items())[:_MAX_REASONS]]
-    if len(failed) > _MAX_REASONS:
-        lines.append(("", f"and {len(failed) - _MAX_REASONS} more (--json lists all)"))
-    return lines
+    return _first([("", f"{name}: {reason}") for name, reason in failed.items()])
+
+
+def _first(lines: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    more = [("", f"and {len(lines) - _MAX_REASONS} more (--json lists all)")] if len(lines) > _MAX_REASONS else []
+    return lines[:_MAX_REASONS] + more

@@ -54,7 +54,7 @@ def fit_budget(
         name, largest, limit = "area_size", native, "the images' own resolution"
     else:
         name, largest = "image_size", min(native, max_image_size)
-        limit = "the images' own resolution" if largest == native else "--max-image-size"
+        limit = "the images' own resolution" if largest == native else "--budget-image-size"
 
     def crop_options(size: int) -> CropOptions:
         crop = replace(options.crop, max_crop_pixels=0)

@@ -70,7 +70,7 @@ def compare(options: CompareOptions, console: Console) -> dict[str, Any]:
                 options=method.applied(labelled, folder, seed),
                 cache=options.output / "cache" / "matches",
                 target=target,
-                max_image_size=options.max_image_size,
+                max_image_size=options.budget_image_size,
             )
             results[method.slug].append(_run(job, inputs, poses))
     content = _content(common.images, cut, methods, names, len(pairs), truth, results)

@@ -33,7 +33,7 @@ class CompareOptions(MatchOptions):
     """Match only this many pairs, evenly over the list (0: all)."""
     report: bool = True
     """Write OUT/report.html."""
-    max_image_size: int = 4096
+    budget_image_size: int = 4096
     """The longest side of a whole image that memory allows a method with a budget."""
 
     def __post_init__(self) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from sgam_core.errors import InputError, OptionError
-from sgam_sfm.images import read_label_map, read_segments
+from sgam_sfm.images import MAX_IMAGE_SIZE, read_label_map, read_segments
 from sgam_sfm.nearest import did_you_mean
 
 INSTANCES = 1000  # a pixel of Cityscapes' and KITTI-360's instance maps is class * 1000 + instance
@@ -60,20 +60,21 @@ class LabelTable:
     instances: str = ""
     segments: Mapping[str, Mapping[int, int]] | None = field(default=None, repr=False)
 
-    def read(self, path: Path) -> Int32[np.ndarray, "H W"]:
+    def read(self, path: Path, max_size: int = MAX_IMAGE_SIZE) -> Int32[np.ndarray, "H W"]:
         """The label map of a file, in the ids of `names`, or instances of them where those are kept apart.
 
+        Args: max_size: in pixels; a map with a longer side is refused.
         Raises: InputError when the file cannot be read, or is not written as the table says.
         """
         if self.segments is None:
-            values = read_label_map(path)
+            values = read_label_map(path, max_size)
             classes = np.where(values >= INSTANCES, values // INSTANCES, values) if self.instances else values
             found = self._classes(classes, path)
             return np.where(found > 0, values, 0) if self.instances == APART else found
         if path.name not in self.segments:
             raise InputError(f"'{path.name}' is not in '{self.choice}'; give the JSON that belongs to these maps")
         table = replace(self, ids={0: 0, **self.segments[path.name]}, segments=None)
-        return table._classes(read_segments(path), path)
+        return table._classes(read_segments(path, max_size), path)
 
     def _classes(self, values: Int32[np.ndarray, "H W"], path: Path) -> Int32[np.ndarray, "H W"]:
         ids = {0: 0, **{value: value for value in self.names}} if self.ids is None else self.ids

@@ -22,9 +22,8 @@ from torch.nn.functional import interpolate, pad, scaled_dot_product_attention, 
 from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Crop, Matches
 from sgam_sfm.hub import load, load_network, transformers_for
-from sgam_sfm.machine import find_device
+from sgam_sfm.machine import find_device, out_of_memory
 from sgam_sfm.matchers.masks import wanted
-from sgam_sfm.matchers.memory import is_out_of_memory
 
 HUB_ID = "zju-community/efficientloftr"
 CELL = 8
@@ -103,7 +102,7 @@ class EfficientLoFTR:
                 for i, pair in enumerate(pairs)
             ]
         except (MemoryError, RuntimeError) as error:
-            if not is_out_of_memory(error):
+            if not out_of_memory(error):
                 raise
             (w0, h0), (w1, h1) = (crop.size for crop in pairs[0])
             raise OptionError(

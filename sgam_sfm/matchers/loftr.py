@@ -21,9 +21,8 @@ from torch import Tensor, nn
 
 from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Crop, Matches
-from sgam_sfm.machine import find_device
+from sgam_sfm.machine import find_device, out_of_memory
 from sgam_sfm.matchers.masks import wanted
-from sgam_sfm.matchers.memory import is_out_of_memory
 from sgam_sfm.matchers.state_dicts import fill
 from sgam_sfm.weights import LOFTR_INDOOR, LOFTR_OUTDOOR, find_weights
 
@@ -108,7 +107,7 @@ class LoFTR:
             sides = (torch.from_numpy(_frames([pair[side] for pair in pairs])).to(self.device) for side in (0, 1))
             found = self._net(dict(zip(("image0", "image1"), sides, strict=True)))
         except (MemoryError, RuntimeError) as error:
-            if not is_out_of_memory(error):
+            if not out_of_memory(error):
                 raise
             (w0, h0), (w1, h1) = (crop.size for crop in pairs[0])
             raise OptionError(

@@ -84,7 +84,7 @@ def coseg_descriptors(options: DescriptorOptions, stages: Stages) -> Descriptors
     use_threads(options.threads)
     cache = options.cache or default_run(options.output) / "cache"
     refuse_among_images(cache, options.images, "--cache")
-    found = read_images(options.images, cache, stages)
+    found = read_images(options.images, cache, stages, options.max_image_size)
     device = str(find_device(options.device, "--device"))
     segmenter = CoSeg(device=device, threads=options.threads, cache_folder=cache)
     vectors: dict[str, np.ndarray] = {}

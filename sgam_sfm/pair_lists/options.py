@@ -58,6 +58,8 @@ class DescriptorOptions(PartnerOptions):
     cache: Path | None = None
     """Folder for the features of coseg. Without it: `out/cache` beside --output, where the `sgam-sfm match` that is
     printed at the end finds them."""
+    max_image_size: int = 16384
+    """Images with a longer side (pixels) are not decoded and count as failed."""
     device: str = "auto"
     """auto, cpu, cuda, cuda:1, ..."""
     threads: int = 0

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from sgam_core.errors import InputError, SGAMError
-from sgam_sfm.images import ImageFile, read_label_map
+from sgam_sfm.images import MAX_IMAGE_SIZE, ImageFile, read_label_map
 from sgam_sfm.label_set import Label, LabelSet, at_size_of, read_label_set
 from sgam_sfm.label_tables import APART, LabelTable, find_table
 
@@ -58,7 +58,7 @@ class LabelFolder:
             advance(1.0)
             yield image, labels
 
-    def read(self, name: str) -> Int32[np.ndarray, "H W"]:
+    def read(self, name: str, max_size: int = MAX_IMAGE_SIZE) -> Int32[np.ndarray, "H W"]:
         """The label map of an image as it is in the folder.
 
         Raises: InputError when there is none, there are two, or it is broken.
@@ -74,13 +74,13 @@ class LabelFolder:
         if len(found) > 1:
             raise InputError(f"two label maps for '{name}': '{found[0]}' and '{found[1]}'; keep one of them")
         path = self.folder / found[0]
-        labels = read_label_map(path) if self._table is None else self._table.read(path)
+        labels = read_label_map(path, max_size) if self._table is None else self._table.read(path, max_size)
         if self._table is not None and self._table.instances == APART:
             self._seen.update(np.unique(labels).tolist())
         return labels
 
     def _labels(self, image: ImageFile) -> Int32[np.ndarray, "H W"]:
-        labels = self.read(image.name)
+        labels = self.read(image.name, max(image.width, image.height, MAX_IMAGE_SIZE))
         if labels.shape != (image.height, image.width) and not self.resize:
             raise InputError(
                 f"labels for '{image.name}' are {labels.shape[0]}x{labels.shape[1]} but the image is "

@@ -25,8 +25,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the te
 wanted, seconds, plain = sys.argv[1], float(sys.argv[2]), progress.Stages.stage
 
 @contextmanager
-def stage(self, name, total):
-    with plain(self, name, total) as advance:
+def stage(self, name, total, done=0.0):
+    with plain(self, name, total, done) as advance:
         if name == wanted:
             threading.Timer(seconds, os.killpg, (0, signal.SIGINT)).start()
         yield advance

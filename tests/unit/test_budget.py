@@ -47,7 +47,7 @@ def test_whole_images_grow_until_the_pixels_are_spent():
     ("largest", "cap"),
     [
         (4096, "capped at the images' own resolution (image-size 2000)"),
-        (1200, "capped at --max-image-size (image-size 1200)"),
+        (1200, "capped at --budget-image-size (image-size 1200)"),
     ],
 )
 def test_a_cap_that_bites_is_told(largest, cap):

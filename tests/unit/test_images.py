@@ -156,14 +156,35 @@ def test_web_page_in_place_of_an_image(tmp_path, content):
     )
 
 
-def test_too_many_pixels(tmp_path, monkeypatch):
+def test_a_longer_side_than_wanted(tmp_path, monkeypatch):
     PillowImage.new("1", (3000, 1000)).save(tmp_path / "a.png")
-    monkeypatch.setattr(PillowImage, "MAX_IMAGE_PIXELS", 2_000_000)
-    assert inspect_image(tmp_path, "a.png").width == 3000  # Pillow warns, which is not for users
-    monkeypatch.setattr(PillowImage, "MAX_IMAGE_PIXELS", 1_000_000)
+    monkeypatch.setattr(PillowImage, "MAX_IMAGE_PIXELS", 1_000_000)  # ours is the limit, and theirs is left alone
+    file = inspect_image(tmp_path, "a.png", 3000)
+    assert read_image(file).shape == (1000, 3000, 3)
+    assert PillowImage.MAX_IMAGE_PIXELS == 1_000_000
     with pytest.raises(InputError) as error:
-        inspect_image(tmp_path, "a.png")
-    assert str(error.value) == "'a.png' has more than 2 million pixels; make it smaller, or remove it"
+        inspect_image(tmp_path, "a.png", 2999)
+    assert str(error.value) == (
+        "'a.png' is 3000x1000 pixels (width x height) and was not decoded; make it smaller, or raise --max-image-size, "
+        "which is 2999"
+    )
+
+
+def test_a_decompression_bomb_is_not_decoded(tmp_path):
+    """A PNG that claims 20,000 x 20,000 pixels, and 100 GB that are a hole in a file."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", 20_000, 20_000, 1, 0, 0, 0, 0)
+    png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+    (tmp_path / "bomb.png").write_bytes(png)
+    with pytest.raises(InputError, match=r"'bomb.png' is 20000x20000 pixels .* raise --max-image-size, which is 16384"):
+        inspect_image(tmp_path, "bomb.png")
+    with (tmp_path / "hole.jpg").open("wb") as file:
+        file.truncate(10**11)
+    with pytest.raises(InputError, match=r"image 'hole.jpg' is a file of 100.0 GB, more than any image of --max-image"):
+        inspect_image(tmp_path, "hole.jpg")
 
 
 def test_broken_metadata_is_passed_over_without_a_warning(tmp_path, colours):

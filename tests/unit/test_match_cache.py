@@ -77,3 +77,17 @@ def test_pixels_of_a_crop_count_once(tmp_path):
     matcher.reset()
     assert counting.resets == 1
     assert matcher.match([]) == []
+
+
+def test_a_damaged_result_is_matched_again(tmp_path, caplog):
+    cached(tmp_path)[0].match([(crop("a"), crop("b"))])
+    (path,) = tmp_path.rglob("*.npz")
+    whole = path.read_bytes()
+    for damaged in (b"", whole[: len(whole) // 2], b"\x80\x04K\x01."):  # the last one is a pickle
+        path.write_bytes(damaged)
+        matcher, counting = cached(tmp_path)
+        (found,) = matcher.match([(crop("a"), crop("b"))])
+        assert counting.asked == [(40, 40)]
+        assert len(found) == 5
+        assert "is damaged" in caplog.text
+        caplog.clear()

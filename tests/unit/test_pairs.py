@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -202,3 +203,26 @@ def test_blocks_hold_every_pair_once_touch_few_images_and_ignore_the_order(pairs
     shuffled = list(pairs)
     random.shuffle(shuffled)
     assert blocks(shuffled, images_per_tile) == tiles
+
+
+def test_long_lists_are_read_line_by_line(tmp_path):
+    path = tmp_path / "pairs.txt"
+    path.write_text("a.jpg sub/c.jpg\nsub/c.jpg a.jpg\n" * 50_000)
+    tracemalloc.start()
+    try:
+        assert read_pairs(path, NAMES) == PairList(
+            pairs=(("a.jpg", "sub/c.jpg"),), num_repeated=49_999, num_reversed=50_000
+        )
+        assert tracemalloc.get_traced_memory()[1] < 500_000  # bytes, of a file of 3.2 MB
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_names_of_pairs_are_shared(pair_file):
+    pairs = read_pairs(pair_file("".join(f"{name} b.jpg\n" for name in ("a.jpg", "sub/c.jpg"))), NAMES).pairs
+    assert pairs[0][1] is pairs[1][1] is NAMES[1]
+
+
+def test_a_line_without_end_is_not_read_to_its_end(pair_file):
+    with pytest.raises(InputError, match="is not a text file; expected UTF-8 text with lines"):
+        read_pairs(pair_file("a.jpg b.jpg\n" + "a" * 70_000), NAMES)

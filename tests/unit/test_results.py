@@ -207,7 +207,8 @@ class TestMessages:
         path.write_bytes(b"not HDF5")
         assert (
             message_of(open_results, out)
-            == f"'{path}' is not a file of pair results; remove it and start the run again"
+            == f"'{path}' is not a file of pair results, or damaged (Unable to synchronously open file (file signature "
+            "not found)); start the run again: its pairs are matched again, all others are kept"
         )
 
     def test_other_plain_matcher(self, out):

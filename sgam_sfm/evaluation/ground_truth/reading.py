@@ -138,7 +138,7 @@ def image_size(path: Path, where: str = "") -> tuple[int, int]:
             warnings.simplefilter("ignore")  # about many pixels, none of which is decoded here
             with PillowImage.open(path) as picture:
                 return picture.size
-    except (OSError, PillowImage.DecompressionBombError) as error:
+    except (OSError, ValueError, PillowImage.DecompressionBombError) as error:  # ValueError: a name with a NUL
         reason = getattr(error, "strerror", None) or "not an image of a known format"
         raise InputError(f"{lead}image '{path}' cannot be read ({reason}); its size is needed") from error
 
