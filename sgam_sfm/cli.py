@@ -29,10 +29,11 @@ from sgam_sfm.files import disk_is_full
 from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.options import MatchOptions, SegmentOptions, starting_options
 from sgam_sfm.pair_lists.options import PairsOptions
-from sgam_sfm.stage_options import AggregateOptions, ExportOptions, LocalizeOptions, ReconstructOptions
+from sgam_sfm.stage_options import AggregateOptions, ExportOptions, JoinOptions, LocalizeOptions, ReconstructOptions
 
 _COMMANDS = {
     MatchOptions: "match",
+    JoinOptions: "join",
     ReconstructOptions: "reconstruct",
     AggregateOptions: "aggregate",
     LocalizeOptions: "localize",

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sgam_core import AreaMatcher, Image, PairResult, PointMatcher, WholeImages, match_described
 from sgam_core.errors import SGAMError
@@ -20,6 +20,9 @@ from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
 from sgam_sfm.progress import Stages
 from sgam_sfm.store import PairRecord, PairStore
+
+if TYPE_CHECKING:
+    from sgam_sfm.executors import Executor, MatchingJob
 
 _log = logging.getLogger(__name__)
 _DESCRIPTIONS_IN_MEMORY = 1024  # about 1 MB each
@@ -44,25 +47,46 @@ def create_area_matcher(options: MatchOptions, ignored: Collection[int] = ()) ->
 
 
 def match_blocks(
-    work: Sequence[Sequence[Pair]], store: PairStore, matcher: CollectionMatcher, stages: Stages
+    work: Sequence[Sequence[Pair]],
+    store: PairStore,
+    executor: Executor,
+    job: MatchingJob,
+    stages: Stages,
+    numbers: Collection[int] | None = None,
 ) -> dict[str, float]:
-    """Match every block that the store does not hold yet, and give the seconds that each step took.
+    """Match every block that the store does not hold yet, and give the seconds that each step took, of all workers.
 
     A block follows from its pairs and the options alone: the point matcher starts each one with empty caches, so that
     what it did before cannot decide how it batches.
+
+    Args: numbers: of the blocks to see to; all of them by default.
     """
-    with stages.stage("Matching pairs", sum(map(len, work))) as advance:
-        for index, block in enumerate(work):
-            if store.has(index):
+    wanted = [(number, work[number]) for number in (range(len(work)) if numbers is None else numbers)]
+    seconds: dict[str, float] = {}
+    with stages.stage("Matching pairs", sum(len(block) for _, block in wanted)) as advance:
+        waiting = []
+        for number, block in wanted:
+            if store.has(number):
                 advance(len(block))
-                continue
-            matcher.start_block()
-            records = []
-            for pair in block:
-                records.append(matcher.match(pair))
-                advance(1)
-            store.write(index, records)
-    return matcher.seconds
+            else:
+                waiting.append((number, block))
+        for number, records in executor.run(job, waiting, advance):
+            store.write(number, records)
+            for record in records:
+                for step, spent in ({} if record.result is None else record.result.seconds).items():
+                    seconds[step] = seconds.get(step, 0.0) + spent
+    return seconds
+
+
+def special_labels(options: MatchOptions, labels: LabelMaps | None) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The labels that form no areas, and those that nothing is matched in.
+
+    Raises: OptionError when the options name a label that is none.
+    """
+    if labels is None:
+        return (), ()
+    ignored = (*labels.set.ignored, *labels.set.ids(options.ignore_labels, "--ignore-labels"))
+    return ignored, labels.set.ids(options.mask_matches, "--mask-matches")
 
 
 class CollectionMatcher:
@@ -75,15 +99,10 @@ class CollectionMatcher:
         self, options: MatchOptions, inputs: Inputs, labels: LabelMaps | None, point_matcher: PointMatcher
     ) -> None:
         self._options, self._inputs, self._labels, self._point_matcher = options, inputs, labels, point_matcher
-        ignored: tuple[int, ...] = ()
-        self._masked: tuple[int, ...] = ()
-        if labels is not None:
-            ignored = (*labels.set.ignored, *labels.set.ids(options.ignore_labels, "--ignore-labels"))
-            self._masked = labels.set.ids(options.mask_matches, "--mask-matches")
+        ignored, self._masked = special_labels(options, labels)
         self._area_matcher = create_area_matcher(options, ignored)
         self.image = lru_cache(2 * options.block_images)(self._read_image)  # those of one block
         self._description = lru_cache(_DESCRIPTIONS_IN_MEMORY)(self._describe)
-        self.seconds: dict[str, float] = {}
 
     def start_block(self) -> None:
         """Empty the point matcher's caches, where it has any."""
@@ -98,8 +117,6 @@ class CollectionMatcher:
         except SGAMError as error:
             _log.warning("%s - %s: %s", *pair, error)
             return PairRecord(pair=pair, result=None, error=str(error))
-        for step, seconds in result.seconds.items():
-            self.seconds[step] = self.seconds.get(step, 0.0) + seconds
         return PairRecord(pair=pair, result=result)
 
     def _match(self, pair: Pair) -> PairResult:
