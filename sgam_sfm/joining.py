@@ -6,19 +6,18 @@ import logging
 import os
 import shutil
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from sgam_core.errors import InputError, OptionError
 from sgam_sfm.executors import MatchingJob
-from sgam_sfm.files import replacing, write_json
+from sgam_sfm.files import replacing
 from sgam_sfm.inputs import read_inputs, refuse_among_images
 from sgam_sfm.label_maps import LabelMaps
 from sgam_sfm.label_set import RECORD, read_label_set
 from sgam_sfm.machine import use_threads
-from sgam_sfm.options import MatchOptions, starting_options
+from sgam_sfm.options import MatchOptions, as_json, starting_options
 from sgam_sfm.pairs import Pair, blocks
 from sgam_sfm.progress import Stages
 from sgam_sfm.results import json_object, open_results
@@ -48,10 +47,13 @@ class _Part:
 def options_of(options: JoinOptions) -> MatchOptions:
     """The options of the whole run, as its shards have them.
 
-    Raises: InputError for a folder that is no shard's output; OptionError when --output lies among the images.
+    Raises: InputError for a folder that is no shard's output; OptionError for an --output that is one, or lies among the
+        images.
     """
     if not options.shards:
         raise OptionError("no shard was given; give the --output folders of all shards of a run")
+    if options.output.resolve() in {folder.resolve() for folder in options.shards}:
+        raise OptionError(f"--output '{options.output}' is the folder of a shard; choose a new one for the whole run")
     first = _read_part(options.shards[0], options.images)
     run = starting_options(first.folder / "options.json", None)
     run = replace(run, output=options.output, images=options.images or run.images, shard="", executor="local")
@@ -70,14 +72,16 @@ def join(options: JoinOptions, stages: Stages | None = None) -> dict[str, Any]:
     _require_one_run(parts)
     work = blocks(parts[0].pairs, run.block_images)
     sources = _sources(parts, work)
-    if any(run.output.resolve() == part.folder.resolve() for part in parts):
-        raise OptionError(f"--output '{run.output}' is the folder of a shard; choose a new one for the whole run")
     existing = stamp_of_existing(run)
     with recording(run.output, stages := stages or Stages(quiet=True)):
         use_threads(run.threads)
-        _take_over(parts[0], run.output)
         inputs = read_inputs(run, stages)
         store = open_store(run, inputs)
+        if store.fingerprint != parts[0].store.fingerprint:
+            raise InputError(
+                f"the shards were matched with other {difference(parts[0].options, as_json(run))}; put back what they "
+                "were matched with, or match them again"
+            )
         with stages.stage("Joining shards", len(work)) as advance:
             for number, part in enumerate(sources):
                 if not store.has(number):
@@ -85,9 +89,8 @@ def join(options: JoinOptions, stages: Stages | None = None) -> dict[str, Any]:
                 advance(1)
             labels = _join_labels(parts, run.output / "labels")
         facts = {"executor": {"name": "shards", "shards": len(parts)}, "matching_seconds": _seconds(parts)}
-        return assemble(
-            MatchingJob(options=run, inputs=inputs, labels=labels), store, len(work), facts, stages, existing
-        )
+        job = MatchingJob(options=run, inputs=inputs, labels=labels)
+        return assemble(job, store, len(work), facts, stages, existing)
 
 
 def _read_part(folder: Path, images: Path | None) -> _Part:
@@ -115,10 +118,9 @@ def _require_one_run(parts: Sequence[_Part]) -> None:
     first = parts[0]
     for part in parts[1:]:
         if part.options["fingerprint"] != first.options["fingerprint"]:
-            other = difference(first.options, part.options).replace(" there,", f" in '{first.folder}',")
             raise OptionError(
-                f"'{part.folder}' does not belong to '{first.folder}': it was matched with other "
-                f"{other.replace(' here)', ' here)')}; join shards of one run"
+                f"'{part.folder}' was matched with other {difference(first.options, part.options)} than "
+                f"'{first.folder}'; join shards of one run"
             )
         if part.shard.count != first.shard.count:
             raise OptionError(
@@ -138,22 +140,17 @@ def _sources(parts: Sequence[_Part], work: Sequence[Sequence[Pair]]) -> list[_Pa
         share = shard.blocks(work)
         done = sum(number in found for number in share)
         if done < len(share):
-            part = by_number.get(shard.number)
-            if part is None:
-                missing.append(str(shard))
+            if shard.number in by_number:
+                folder = by_number[shard.number].folder
+                begun.append(f"{shard} in '{folder}' has {done} of {len(share)} blocks; {_again(folder)}")
             else:
-                begun.append(f"{shard} in '{part.folder}' has {done} of {len(share)} blocks; {_again(part.folder)}")
+                missing.append(str(shard))
     if missing:
-        raise InputError(f"shards {', '.join(missing)} are missing; give the --output folders of all {count} shards")
+        named = f"shard {missing[0]} is" if len(missing) == 1 else f"shards {', '.join(missing)} are"
+        raise InputError(f"{named} missing; give the --output folders of all {count} shards")
     if begun:
         raise InputError(f"shard {'; shard '.join(begun)}")
     return [found[number] for number in range(len(work))]
-
-
-def _take_over(part: _Part, output: Path) -> None:
-    """The mark of the run, unless OUT has one: what the shards were made from is compared with what is there now."""
-    if not (output / "options.json").exists():
-        write_json(output / "options.json", part.options | {"shard": ""})
 
 
 def _link(source: Path, target: Path) -> None:
@@ -175,8 +172,8 @@ def _join_labels(parts: Sequence[_Part], folder: Path) -> LabelMaps | None:
     for other, path in made.items():
         if path.read_bytes() != source.read_bytes():
             _log.warning(
-                "the label maps of '%s' and '%s' differ (other machines or threads?): pairs are sound, but not those of "
-                "an undivided run; `sgam-sfm segment` first, then --labels, gives all shards the same",
+                "the label maps of '%s' and '%s' differ (other machines or threads?): their pairs are sound, but not "
+                "those of a run without shards; segment first, then match all shards with the same --labels",
                 first,
                 other,
             )
@@ -190,7 +187,6 @@ def _seconds(parts: Sequence[_Part]) -> dict[str, float]:
     """The seconds that each step of the matching took in all shards."""
     total: dict[str, float] = {}
     for part in parts:
-        with suppress(AttributeError):
-            for step, seconds in json_object(part.folder / "summary.json").get("matching_seconds", {}).items():
-                total[step] = total.get(step, 0.0) + seconds
+        for step, seconds in json_object(part.folder / "summary.json").get("matching_seconds", {}).items():
+            total[step] = total.get(step, 0.0) + seconds
     return total

@@ -55,7 +55,7 @@ class Terms:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class _Done:
+class Done:
     """A block's records, and who matched it: the address of a machine, and Ray's number of it."""
 
     records: Sequence[PairRecord]
@@ -185,11 +185,11 @@ class RayExecutor:
     def facts(self) -> dict[str, Any]:
         return {"name": "ray", "blocks_of_machines": dict(self.blocks_of), "copied_blocks": sorted(self.copies)}
 
-    def _results(self, job: MatchingJob, blocks: Mapping[int, Sequence[Pair]]) -> Iterator[tuple[int, _Done]]:
+    def _results(self, job: MatchingJob, blocks: Mapping[int, Sequence[Pair]]) -> Iterator[tuple[int, Done]]:
         """The result of every block, once. Raises: StageError for blocks that no worker survived, at the end."""
         import ray
 
-        terms = ray.put(_terms(job))
+        terms = ray.put(terms_of(job))
         resources = {"num_cpus": self.need["CPU"], "num_gpus": self.need.get("GPU", 0)}
         task = ray.remote(max_retries=_RETRIES, **resources)(match_block)
         waiting = deque(blocks)
@@ -212,7 +212,7 @@ class RayExecutor:
                     if flight.number not in open_blocks:
                         continue  # its copy was faster
                     try:
-                        done: _Done = ray.get(reference)
+                        done: Done = ray.get(reference)
                     except ray.exceptions.RayError as error:
                         _raise_own(error)
                         if not any(other.number == flight.number for other in flights.values()):
@@ -280,7 +280,7 @@ def _raise_own(error: Exception) -> None:
         raise error
 
 
-def _terms(job: MatchingJob) -> Terms:
+def terms_of(job: MatchingJob) -> Terms:
     """What all blocks have in common, for a process that works in another folder."""
     options, labels = job.options, job.labels
     paths = {name: getattr(options, name) for name in ("images", "output", "mask_path", "weights")}
@@ -307,7 +307,7 @@ def _part_of(inputs: Inputs, block: Sequence[Pair]) -> Inputs:
     )
 
 
-def match_block(terms: Terms, inputs: Inputs, block: Sequence[Pair]) -> _Done:
+def match_block(terms: Terms, inputs: Inputs, block: Sequence[Pair]) -> Done:
     """Match a block: what a worker does.
 
     Raises: InputError when this machine does not see the run's files, or has other versions of what results depend on.
@@ -320,7 +320,7 @@ def match_block(terms: Terms, inputs: Inputs, block: Sequence[Pair]) -> _Done:
     matcher = CollectionMatcher(terms.options, inputs, terms.labels, _point_matcher(terms.options))
     matcher.start_block()
     records = [matcher.match(pair) for pair in block]
-    return _Done(records=records, node=f"{socket.gethostname()} ({ray.get_runtime_context().get_node_id()[:8]})")
+    return Done(records=records, node=f"{socket.gethostname()} ({ray.get_runtime_context().get_node_id()[:8]})")
 
 
 def require_alike(terms: Terms) -> None:
