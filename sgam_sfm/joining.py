@@ -47,8 +47,8 @@ class _Part:
 def options_of(options: JoinOptions) -> MatchOptions:
     """The options of the whole run, as its shards have them.
 
-    Raises: InputError for a folder that is no shard's output; OptionError for an --output that is one, or lies among the
-        images.
+    Raises: InputError for a folder that is no shard's output; OptionError for an --output that is a shard's, or lies
+        among the images.
     """
     if not options.shards:
         raise OptionError("no shard was given; give the --output folders of all shards of a run")
