@@ -81,9 +81,7 @@ def connected(options: MatchOptions) -> Iterator[RayExecutor]:
         _require_room(need)
         own_device = "cpu" if device == "cpu" else str(find_device("auto"))
         use_threads(options.threads)
-        create_matcher(
-            replace(options, device="cpu")
-        )  # what is wrong with it is better known before the images are read
+        create_matcher(replace(options, device="cpu"))  # what is wrong with it is to be known before images are read
         yield RayExecutor(device=device, own_device=own_device, need=need)
     finally:
         if ours:
@@ -99,20 +97,15 @@ def _connect(address: str) -> None:
             "command on one of its machines with --ray-address auto"
         )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    alone = {"include_dashboard": False} if address == "local" else {}
     try:
-        ray.init(
-            address=address, log_to_driver=False, logging_level=logging.ERROR, include_dashboard=_dashboard(address)
-        )
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **alone)
     except (OSError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise OptionError(
             f"--ray-address '{address}': no Ray cluster can be reached ({reason}); start one with `ray start --head`, "
             "on the other machines `ray start --address HEAD:6379`, or use --ray-address local for this machine alone"
         ) from error
-
-
-def _dashboard(address: str) -> bool | None:
-    return False if address == "local" else None
 
 
 def _device(name: str, resources: Mapping[str, float]) -> str:
@@ -196,7 +189,7 @@ class RayExecutor:
         flights: dict[Any, Flight] = {}
         open_blocks = set(blocks)
         lost: dict[int, str] = {}
-        longest = 0.0
+        longest, stranded = 0.0, False
 
         def send(number: int) -> None:
             block = blocks[number]
@@ -204,7 +197,11 @@ class RayExecutor:
 
         try:
             while open_blocks:
-                while waiting and len(flights) < _BLOCKS_PER_WORKER * max(self._places_now(), 1):
+                places = self._places_now()
+                if not places and not stranded:
+                    _log.warning("no machine of the Ray cluster has room for a worker now; waiting for one")
+                stranded = not places
+                while waiting and len(flights) < _BLOCKS_PER_WORKER * max(places, 1):
                     send(waiting.popleft())
                 ready, _ = ray.wait(list(flights), timeout=_TICK_SECONDS)
                 for reference in ready:
@@ -228,7 +225,7 @@ class RayExecutor:
                         self.copies[number] += 1
                         send(number)
         finally:
-            for reference in flights:
+            for reference in flights if ray.is_initialized() else ():
                 ray.cancel(reference, force=True)
         if lost:
             number, reason = min(lost.items())

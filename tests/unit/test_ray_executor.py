@@ -50,7 +50,7 @@ class StandIn:
         self.down = False
 
     def is_initialized(self) -> bool:
-        return False
+        return bool(self.settings) and not self.down
 
     def init(self, **settings: Any) -> None:
         self.settings = settings
