@@ -17,7 +17,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
+from scenes import scene_options, split_options
 
 RUNS = (
     *(f"{scene}{cut}" for scene in ("Herz-Jesus-P8", "fountain-P11") for cut in ("", ":every=2", ":zoom=2.5")),
@@ -58,22 +58,17 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--runs", nargs="*", default=list(RUNS))
-    own = sys.argv[1:]
-    split = own.index("--") if "--" in own else len(own)
-    arguments = parser.parse_args(own[:split])
+    own, passed_on = split_options(sys.argv[1:])
+    arguments = parser.parse_args(own)
     for run in arguments.runs:
-        compare(arguments.data, arguments.out, run, own[split + 1 :])
+        compare(arguments.data, arguments.out, run, passed_on)
     print(table({run: arguments.out / folder_of(run) for run in RUNS}))
 
 
 def compare(data: Path, out: Path, run: str, options: list[str]) -> None:
     """One comparison."""
     scene, _, cut = run.partition(":")
-    K = np.loadtxt(data / scene / "images" / "K.txt").reshape(3, 3)
-    params = ",".join(str(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    files = ["--images", data / scene / "images", "--output", out / folder_of(run)]
-    camera = ["--camera-model", "PINHOLE", "--camera-params", params, "--camera-mode", "single"]
-    truth = ["--ground-truth", data / scene / "gt_dense_cameras"]
+    files = [*scene_options(data / scene), "--output", out / folder_of(run)]
     if scene in PARTNERS:
         names = sorted(path.name for path in (data / scene / "images").glob("*.jpg"))
         around = [
@@ -84,7 +79,7 @@ def compare(data: Path, out: Path, run: str, options: list[str]) -> None:
         out.mkdir(parents=True, exist_ok=True)
         (out / f"{scene}.txt").write_text("".join(f"{a} {b}\n" for a, b in around))
         files += ["--pairs", out / f"{scene}.txt"]
-    command = [sys.executable, "-m", "sgam_sfm", "compare", *files, *camera, *truth, "--methods", *METHODS, *options]
+    command = [sys.executable, "-m", "sgam_sfm", "compare", *files, "--methods", *METHODS, *options]
     subprocess.run([*map(str, command), *(["--hard", cut] if cut else [])], check=True)
 
 

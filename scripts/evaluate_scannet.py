@@ -15,6 +15,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from scenes import scene_options, split_options
+
 COLUMNS = {
     "auc_5": "AUC@5",
     "auc_10": "@10",
@@ -39,16 +41,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("scenes", type=Path, nargs="+")
-    own = sys.argv[1:]
-    split = own.index("--") if "--" in own else len(own)
-    arguments = parser.parse_args(own[:split])
+    own, passed_on = split_options(sys.argv[1:])
+    arguments = parser.parse_args(own)
     rows = [["scene", "labels", "variant", *COLUMNS.values()], ["---"] * (len(COLUMNS) + 3)]
     for scene in arguments.scenes:
         folder = next(path for name in ("label-filt", "label") if (path := scene / name).is_dir())
         for labels, options in (("its own", ["--labels", str(folder), "--resize-labels"]), ("coseg", [])):
             output = arguments.out / f"{scene.name}_{labels.replace(' ', '_')}"
             if not (output / "evaluate.json").exists():
-                evaluate(scene, output, [*options, *own[split + 1 :]])
+                evaluate(scene, output, [*options, *passed_on])
             content = json.loads((output / "evaluate.json").read_text())
             for variant in content["variants"]:
                 values = (variant["figures"].get(name) for name in COLUMNS)
@@ -59,8 +60,8 @@ def main() -> None:
 
 def evaluate(scene: Path, output: Path, options: list[str]) -> None:
     """One evaluation."""
-    files = ["--images", str(scene / "color"), "--ground-truth", str(scene), "--output", str(output)]
-    command = [sys.executable, "-m", "sgam_sfm", "evaluate", "--ablation", "--preset", "scannet", *files, *options]
+    fixed = ["--ablation", "--preset", "scannet", *scene_options(scene), "--output", str(output)]
+    command = [sys.executable, "-m", "sgam_sfm", "evaluate", *fixed, *options]
     subprocess.run(command, check=True)
 
 

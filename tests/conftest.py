@@ -6,10 +6,12 @@ import os
 from pathlib import Path
 
 import jaxtyping
+import PIL.Image
 import pytest
 
 from tests.paths import DATA
 from tests.room import Room, small_room
+from tests.tutorials import DOCS, follow
 
 
 @pytest.fixture(scope="session")
@@ -26,6 +28,24 @@ def data() -> Path:
 def room() -> Room:
     """The rendered room, in small."""
     return small_room()
+
+
+@pytest.fixture(scope="session")
+def tutorial(room: Room, tmp_path_factory) -> Path:
+    """A folder where the first tutorial has been followed, on three views of the room: `photos` and the run `out`."""
+    folder: Path = tmp_path_factory.mktemp("tutorial")
+    (folder / "photos").mkdir()
+    for name in list(room.images)[:3]:
+        PIL.Image.fromarray(room.images[name].pixels).save(folder / "photos" / name, quality=95)
+    follow(DOCS / "tutorials/photos.md", folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def splat(tutorial: Path) -> Path:
+    """The folder for trainers of Gaussian splatting that the tutorial for them makes of that run."""
+    follow(DOCS / "tutorials/splatting.md", tutorial)
+    return tutorial / "splat"
 
 
 @pytest.fixture
