@@ -33,6 +33,7 @@ from sgam_sfm.summary import versions
 
 _log = logging.getLogger(__name__)
 _RETRIES = 5  # of a block whose worker died
+_CONNECT_SECONDS = 5.0
 _TICK_SECONDS = 1.0
 _BLOCKS_PER_WORKER = 2  # handed out at a time: one to work on, one to begin with at once
 _PATIENCE = 3.0  # times the longest turnaround so far, after which a block is a straggler
@@ -98,9 +99,12 @@ def _connect(address: str) -> None:
         )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     alone = {"include_dashboard": False} if address == "local" else {}
+    host, _, port = address.rpartition(":")
     try:
+        if host and port.isdecimal():  # Ray itself tries for minutes
+            socket.create_connection((host, int(port)), timeout=_CONNECT_SECONDS).close()
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **alone)
-    except (OSError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+    except (OSError, OverflowError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise OptionError(
             f"--ray-address '{address}': no Ray cluster can be reached ({reason}); start one with `ray start --head`, "

@@ -246,6 +246,15 @@ def test_a_cluster_that_is_not_there(job, cluster, monkeypatch):
         pass
 
 
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "127.0.0.1:99999"])
+def test_a_head_that_does_not_answer_is_told_at_once(job, cluster, address):
+    stand_in = cluster()
+    expected = rf"--ray-address '{address}': no Ray cluster can be reached \(.+\); start one with"
+    with pytest.raises(OptionError, match=expected), open_executor(replace(job.options, ray_address=address)):
+        pass
+    assert not stand_in.settings
+
+
 def test_without_ray_the_extra_is_named(job, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with (
