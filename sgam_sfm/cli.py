@@ -33,11 +33,11 @@ from sgam_sfm.stage_options import AggregateOptions, ExportOptions, JoinOptions,
 
 _COMMANDS = {
     MatchOptions: "match",
-    JoinOptions: "join",
     ReconstructOptions: "reconstruct",
     AggregateOptions: "aggregate",
     LocalizeOptions: "localize",
     ExportOptions: "export",
+    JoinOptions: "join",
     CompareOptions: "compare",
     EvaluateOptions: "evaluate",
     PairsOptions: "pairs",
