@@ -30,7 +30,7 @@ from sgam_sfm.machine import out_of_memory
 from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.options import MatchOptions, SegmentOptions, starting_options
 from sgam_sfm.pair_lists.options import PairsOptions
-from sgam_sfm.stage_options import AggregateOptions, ExportOptions, LocalizeOptions, ReconstructOptions
+from sgam_sfm.stage_options import AggregateOptions, ExportOptions, JoinOptions, LocalizeOptions, ReconstructOptions
 
 _COMMANDS = {
     MatchOptions: "match",
@@ -38,6 +38,7 @@ _COMMANDS = {
     AggregateOptions: "aggregate",
     LocalizeOptions: "localize",
     ExportOptions: "export",
+    JoinOptions: "join",
     CompareOptions: "compare",
     EvaluateOptions: "evaluate",
     PairsOptions: "pairs",

@@ -31,12 +31,14 @@ from sgam_sfm.colmap_reading import read_model
 from sgam_sfm.database import CameraInfo, CameraOptions, camera_of_info, import_cameras
 from sgam_sfm.evaluation.ground_truth.camera_table import write_camera_table
 from sgam_sfm.evaluation.ground_truth.types import TrueView
+from sgam_sfm.executors import MatchingJob
+from sgam_sfm.executors.local import LocalExecutor
 from sgam_sfm.files import replacing, write_json
 from sgam_sfm.images import inspect_image
 from sgam_sfm.inputs import Inputs, read_images
 from sgam_sfm.label_maps import make_label_maps
-from sgam_sfm.machine import find_device, use_threads
-from sgam_sfm.matching import CollectionMatcher, create_area_matcher, create_matcher, match_blocks
+from sgam_sfm.machine import find_device
+from sgam_sfm.matching import create_area_matcher, match_blocks
 from sgam_sfm.options import MatchOptions, starting_options
 from sgam_sfm.pairs import PairList, blocks, read_pairs
 from sgam_sfm.progress import Stages
@@ -87,15 +89,14 @@ def _localize(
     stages: Stages,
     point_matcher: PointMatcher | None,
 ) -> dict[str, Any]:
-    use_threads(options.threads)
     run = _options_of_run(options, results)
+    executor = LocalExecutor.of(run, point_matcher)
     inputs, photos = _read_inputs(options, results, model, stages)
     store = open_store(run, inputs)
     needs_labels = create_area_matcher(run).needs_labels or bool(run.mask_matches)
     labels = make_label_maps(run, inputs.images, stages) if needs_labels else None
     work = blocks(inputs.pairs.pairs, run.block_images)
-    matcher = CollectionMatcher(run, inputs, labels, point_matcher or create_matcher(run))
-    match_blocks(work, store, matcher, stages)
+    match_blocks(work, store, executor, MatchingJob(options=run, inputs=inputs, labels=labels), stages)
 
     by_photo: dict[str, list[PairRecord]] = {name: [] for name in photos}
     for record in store.read_all(len(work)):
@@ -144,6 +145,8 @@ def _options_of_run(options: LocalizeOptions, results: Results) -> MatchOptions:
         rigs=None,
         database=None,
         mapping=False,
+        executor="local",
+        shard="",
     )
 
 

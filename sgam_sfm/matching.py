@@ -6,10 +6,10 @@ import logging
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sgam_core import AreaMatcher, Image, PairResult, PointMatcher, WholeImages, match_described
-from sgam_core.errors import SGAMError, StageError
+from sgam_core.errors import OptionError, SGAMError, StageError
 from sgam_sfm import registry
 from sgam_sfm.database import camera_matrix
 from sgam_sfm.external import WorkerCommand
@@ -22,7 +22,9 @@ from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
 from sgam_sfm.progress import Stages
 from sgam_sfm.store import PairRecord, PairStore, read_outcomes
-from sgam_sfm.supervision import given_up
+
+if TYPE_CHECKING:
+    from sgam_sfm.executors import Executor, MatchingJob
 
 _log = logging.getLogger(__name__)
 _DESCRIPTIONS_IN_MEMORY = 1024  # about 1 MB each
@@ -52,31 +54,46 @@ def create_area_matcher(options: MatchOptions, ignored: Collection[int] = ()) ->
 
 
 def match_blocks(
-    work: Sequence[Sequence[Pair]], store: PairStore, matcher: CollectionMatcher, stages: Stages
+    work: Sequence[Sequence[Pair]],
+    store: PairStore,
+    executor: Executor,
+    job: MatchingJob,
+    stages: Stages,
+    numbers: Collection[int] | None = None,
 ) -> dict[str, float]:
-    """Match every block that the store does not hold yet, and give the seconds that each step took.
+    """Match every block that the store does not hold yet, and give the seconds that each step took, of all workers.
 
     A block follows from its pairs and the options alone: the point matcher starts each one with empty caches, so that
     what it did before cannot decide how it batches.
+
+    Args: numbers: of the blocks to see to; all of them by default.
     """
-    kept = {index for index, block in enumerate(work) if store.has(index, block)}
+    wanted = range(len(work)) if numbers is None else numbers
+    kept = {number for number in wanted if store.has(number, work[number])}
     count_outcomes(stages, store, kept)
-    done = sum(len(work[index]) for index in kept)
-    with stages.stage("Matching pairs", sum(map(len, work)), done) as advance:
-        for index, block in enumerate(work):
-            if index in kept:
-                continue
-            matcher.start_block()
-            records = []
-            for pair in block:
-                stages.working_on(pair)
-                reason = given_up(pair)
-                record = _failed(pair, reason) if reason else matcher.match(pair)
-                records.append(record)
-                stages.counts.update(_counted(record.error, record.result.fallback if record.result else ""))
-                advance(1)
-            store.write(index, records)
-    return matcher.seconds
+    done = sum(len(work[number]) for number in kept)
+    seconds: dict[str, float] = {}
+    with stages.stage("Matching pairs", sum(len(work[number]) for number in wanted), done) as advance:
+        waiting = [(number, work[number]) for number in wanted if number not in kept]
+        for number, records in executor.run(job, waiting, advance, stages.working_on):
+            store.write(number, records)
+            for record in records:
+                result = record.result
+                stages.counts.update(_counted(record.error, result.fallback if result else ""))
+                for step, spent in (result.seconds if result else {}).items():
+                    seconds[step] = seconds.get(step, 0.0) + spent
+    return seconds
+
+
+def special_labels(options: MatchOptions, labels: LabelMaps | None) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The labels that form no areas, and those that nothing is matched in.
+
+    Raises: OptionError when the options name a label that is none.
+    """
+    if labels is None:
+        return (), ()
+    ignored = (*labels.set.ignored, *labels.set.ids(options.ignore_labels, "--ignore-labels"))
+    return ignored, labels.set.ids(options.mask_matches, "--mask-matches")
 
 
 def count_outcomes(stages: Stages, store: PairStore, blocks: Iterable[int]) -> None:
@@ -93,7 +110,8 @@ def _counted(error: str, fallback: str) -> tuple[str, ...]:
     return ("pairs_done", "fallbacks") if fallback else ("pairs_done",)
 
 
-def _failed(pair: Pair, reason: str) -> PairRecord:
+def failed_record(pair: Pair, reason: str) -> PairRecord:
+    """The record of a pair that could not be matched."""
     _log.warning("%s - %s: %s", *pair, reason)
     return PairRecord(pair=pair, result=None, error=reason)
 
@@ -108,15 +126,10 @@ class CollectionMatcher:
         self, options: MatchOptions, inputs: Inputs, labels: LabelMaps | None, point_matcher: PointMatcher
     ) -> None:
         self._options, self._inputs, self._labels, self._point_matcher = options, inputs, labels, point_matcher
-        ignored: tuple[int, ...] = ()
-        self._masked: tuple[int, ...] = ()
-        if labels is not None:
-            ignored = (*labels.set.ignored, *labels.set.ids(options.ignore_labels, "--ignore-labels"))
-            self._masked = labels.set.ids(options.mask_matches, "--mask-matches")
+        ignored, self._masked = special_labels(options, labels)
         self._area_matcher = create_area_matcher(options, ignored)
         self.image = lru_cache(2 * options.block_images)(self._read_image)  # those of one block
         self._description = lru_cache(_DESCRIPTIONS_IN_MEMORY)(self._describe)
-        self.seconds: dict[str, float] = {}
 
     def start_block(self) -> None:
         """Empty the point matcher's caches, where it has any."""
@@ -134,9 +147,7 @@ class CollectionMatcher:
         except StageError:
             raise
         except SGAMError as error:
-            return _failed(pair, str(error))
-        for step, seconds in result.seconds.items():
-            self.seconds[step] = self.seconds.get(step, 0.0) + seconds
+            return failed_record(pair, str(error))
         return PairRecord(pair=pair, result=result)
 
     def _match_within_memory(self, pair: Pair) -> PairResult:
@@ -154,7 +165,7 @@ class CollectionMatcher:
             if isinstance(error, SGAMError) or not out_of_memory(error):
                 raise
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise StageError(
+            raise OptionError(
                 f"memory does not suffice ({reason}); lower --image-size and --area-size, or take another --matcher"
             ) from error
 

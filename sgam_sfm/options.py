@@ -30,6 +30,7 @@ from sgam_core.options import (
     TileOptions,
 )
 from sgam_sfm.keypoints import KeypointOptions
+from sgam_sfm.shards import Shard
 
 Preset = Literal["default", "paper", "scannet", "outdoor"]
 _STAGES = tuple(stage.name for stage in fields(SGAMOptions))
@@ -126,6 +127,15 @@ class MatchOptions:
 
     max_image_size: int = 16384
     """Images with a longer side (pixels) are not decoded and count as failed."""
+    executor: Literal["local", "ray"] = "local"
+    """Who matches the pairs: this process, or the workers of a Ray cluster, one a GPU, or without GPUs one for every
+    --threads cores (0: one core)."""
+    ray_address: str = "auto"
+    """The Ray cluster: auto, the one that this machine is part of; HOST:PORT of its head; or local, to start Ray on
+    this machine alone."""
+    shard: str = ""
+    """i/n: match only the i-th of n shares of the pairs (i from 1) and stop before merging; `sgam-sfm join` puts the
+    output folders of all shares together."""
     block_images: int = 8
     """A block of pairs, the unit of work and of resume, joins up to this many images with as many others."""
     device: str = "auto"
@@ -161,6 +171,10 @@ class MatchOptions:
     """Guided areas: a second, finer round."""
     keypoints: KeypointOptions = field(default_factory=KeypointOptions)
     """Merging the points of all pairs into keypoints."""
+
+    def __post_init__(self) -> None:
+        if self.shard:
+            Shard.parse(self.shard)
 
     @property
     def sgam(self) -> SGAMOptions:
@@ -227,6 +241,7 @@ class SegmentOptions:
 
 NOT_IN_RESULTS = frozenset(
     {"images", "pairs", "cameras", "rigs", "output", "config", "threads", "verbose", "log_json", "accept_licence"}
+    | {"executor", "ray_address", "shard"}
     | {"refine_intrinsics", "mapper", "mapping", "keypoints", "database", "append", "max_image_size", "worker_timeout"}
 )
 """Options that the raw results of pairs do not follow from: a run can be continued with others. The images, pairs and

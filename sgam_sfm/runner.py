@@ -6,7 +6,6 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from sgam_core import PointMatcher
@@ -14,18 +13,20 @@ from sgam_core.errors import OptionError
 from sgam_sfm.appending import Stamp, append_to_database, replace_database, stamp_of
 from sgam_sfm.assembly import build_models, merge_records, verify_pairs
 from sgam_sfm.database import is_whole, write_database
+from sgam_sfm.executors import MatchingJob, open_executor
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.label_set import RECORD
-from sgam_sfm.machine import find_device, peak_memory_mb, use_threads
+from sgam_sfm.machine import peak_memory_mb
 from sgam_sfm.mapping import MappingOptions, MappingSummary, VerificationOptions, VerificationSummary
-from sgam_sfm.matching import CollectionMatcher, count_outcomes, create_area_matcher, create_matcher, match_blocks
+from sgam_sfm.matching import count_outcomes, create_area_matcher, match_blocks
 from sgam_sfm.options import NOT_IN_RESULTS, VERSION, MatchOptions, as_json, fingerprint
 from sgam_sfm.pairs import Pair, blocks
 from sgam_sfm.progress import Stages
 from sgam_sfm.results import json_object
 from sgam_sfm.run_record import recording
+from sgam_sfm.shards import Shard
 from sgam_sfm.store import PairStore
 from sgam_sfm.summary import summarise_images, summarise_keypoints, summarise_pairs, versions
 
@@ -54,32 +55,68 @@ def match_collection(
 def _match_collection(
     options: MatchOptions, stages: Stages, point_matcher: PointMatcher | None, ended_well: bool
 ) -> dict[str, Any]:
-    options = replace(options, device=str(find_device(options.device, "--device")))
-    use_threads(options.threads)
-    point_matcher = point_matcher or create_matcher(options)
     needs_labels = create_area_matcher(options).needs_labels or bool(options.mask_matches)
-    output = options.output
+    existing = stamp_of_existing(options)
+    with open_executor(options, point_matcher) as executor:
+        options = replace(options, device=executor.device)
+        inputs = read_inputs(options, stages)
+        stages.counts.update(images=len(inputs.images), images_failed=len(inputs.failed), pairs=len(inputs.pairs.pairs))
+        same = ended_well and same_options(options)
+        store = open_store(options, inputs)
+        work = blocks(inputs.pairs.pairs, options.block_images)
+        if same and (summary := finished(options, store, work)) is not None:
+            count_outcomes(stages, store, range(len(work)))
+            if not stages.quiet:
+                again = "`sgam-sfm reconstruct` makes the model anew"
+                told = f"'{options.output}' is complete, and nothing has changed since; {again}"
+                stages.console.print(told, soft_wrap=True)
+            return summary
+        (options.output / "summary.json").unlink(missing_ok=True)  # of a run that this one goes on from
+        segmenting = replace(options, device=executor.own_device)
+        labels = make_label_maps(segmenting, inputs.images, stages) if needs_labels else None
+        share = Shard.parse(options.shard).blocks(work) if options.shard else range(len(work))
+        job = MatchingJob(options=options, inputs=inputs, labels=labels)
+        steps = match_blocks(work, store, executor, job, stages, share)
+        facts = {"executor": executor.facts(), "matching_seconds": steps}
+    if options.shard:
+        return _summarise_shard(job, store, share, facts, stages)
+    return assemble(job, store, len(work), facts, stages, existing)
 
-    existing = None if options.database is None else _stamp(options.database, output)
-    inputs = read_inputs(options, stages)
-    stages.counts.update(images=len(inputs.images), images_failed=len(inputs.failed), pairs=len(inputs.pairs.pairs))
-    same = ended_well and same_options(options)
-    store = open_store(options, inputs)
-    work = blocks(inputs.pairs.pairs, options.block_images)
-    if same and (summary := finished(options, store, work)) is not None:
-        count_outcomes(stages, store, range(len(work)))
-        if not stages.quiet:
-            again = "`sgam-sfm reconstruct` makes the model anew"
-            stages.console.print(f"'{output}' is complete, and nothing has changed since; {again}", soft_wrap=True)
-        return summary
-    (output / "summary.json").unlink(missing_ok=True)  # of a run that this one goes on from
 
-    labels = make_label_maps(options, inputs.images, stages) if needs_labels else None
-    matcher = CollectionMatcher(options, inputs, labels, point_matcher)
-    steps = match_blocks(work, store, matcher, stages)
+def _summarise_shard(
+    job: MatchingJob, store: PairStore, share: range, facts: dict[str, Any], stages: Stages
+) -> dict[str, Any]:
+    """What is known of a run that stops before merging, as OUT/summary.json."""
+    nothing = VerificationSummary(inliers={}, num_pairs=0, seconds=0.0, peak_memory_mb=None)
+    records = (record for number in share for record in store.read(number))
+    summary = {
+        "shard": {"shard": job.options.shard, "blocks": len(share)},
+        "images": summarise_images(job.inputs),
+        "pairs": summarise_pairs(job.inputs, records, nothing),
+        "labels": _summarise_labels(job),
+        "models": [],
+        "no_model": f"shard {job.options.shard} has its own pairs only; `sgam-sfm join` puts all shards together",
+        "seconds": stages.seconds,
+        **facts,
+        "peak_memory_mb": {"matching": peak_memory_mb()},
+        "device": job.options.device,
+        "versions": versions(),
+    }
+    written: dict[str, Any] = write_json(job.options.output / "summary.json", summary)
+    return written
 
+
+def assemble(
+    job: MatchingJob, store: PairStore, num_blocks: int, facts: dict[str, Any], stages: Stages, existing: Stamp | None
+) -> dict[str, Any]:
+    """Keypoints, database and model from a store that holds all blocks.
+
+    Args: facts: what the summary is to say of the matching. existing: stamp of --database, see `reconstruct`.
+    Returns: the content of OUT/summary.json.
+    """
+    options, inputs, output = job.options, job.inputs, job.options.output
     with stages.stage("Merging keypoints", None):
-        records = list(store.read_all(len(work)))
+        records = list(store.read_all(num_blocks))
         merged = merge_records(records, options.keypoints, options.geometry.max_residual, output)
         write = write_database if existing is None else append_to_database
         write(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
@@ -88,12 +125,12 @@ def _match_collection(
     summary = {
         "images": summarise_images(inputs),
         "pairs": summarise_pairs(inputs, records, verified),
-        "labels": {} if labels is None else {"failed": labels.set.failed, **labels.set.facts},
+        "labels": _summarise_labels(job),
         "keypoints": summarise_keypoints(merged),
         "models": [] if mapped is None else mapped.models,
         "no_model": "mapping was not asked for (--no-mapping)" if mapped is None else mapped.reason,
         "seconds": stages.seconds,
-        "matching_seconds": steps,
+        **facts,
         "peak_memory_mb": {
             "matching": peak_memory_mb(),
             "verification": verified.peak_memory_mb,
@@ -129,11 +166,15 @@ def finished(options: MatchOptions, store: PairStore, work: Sequence[Sequence[Pa
     return summary
 
 
+def _summarise_labels(job: MatchingJob) -> dict[str, Any]:
+    return {} if job.labels is None else {"failed": job.labels.set.failed, **job.labels.set.facts}
+
+
 def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
     """The store of raw results in OUT, bound to options and inputs, which are written to OUT as JSON.
 
     An options.json that the disk has damaged is written anew: every block knows its own fingerprint.
-    Raises: OptionError when OUT was begun with others, naming them.
+    Raises: OptionError when OUT was begun with others, naming them, or holds another shard.
     """
     mark = fingerprint(options, images=inputs.digests, pairs=inputs.pairs.pairs, cameras=inputs.cameras)
     path = options.output / "options.json"
@@ -148,6 +189,12 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
                     f"'{options.output}' was begun with other {difference(before, now)}; choose a new --output folder"
                 )
             (options.output / "labels" / RECORD).unlink(missing_ok=True)  # they follow from the options too
+        other = before.get("shard", "")
+        if options.shard and other not in ("", options.shard):
+            raise OptionError(
+                f"'{options.output}' holds shard {other}, not {options.shard}; give each shard an --output folder of "
+                "its own"
+            )
     write_json(path, now)
     given = sorted(name for name, camera in inputs.cameras.items() if camera.known)
     known = {"images": inputs.digests, "failed": inputs.failed, KNOWN_CAMERAS: given}
@@ -176,8 +223,15 @@ def _flags(options: dict[str, Any], prefix: str = "--") -> dict[str, Any]:
     return flat
 
 
-def _stamp(database: Path, output: Path) -> Stamp:
-    if database.resolve() == (output / "database.db").resolve():
+def stamp_of_existing(options: MatchOptions) -> Stamp | None:
+    """The stamp of --database, None without one.
+
+    Raises: OptionError when it is what the run writes itself.
+    """
+    database = options.database
+    if database is None:
+        return None
+    if database.resolve() == (options.output / "database.db").resolve():
         raise OptionError(f"--database '{database}' is what the run writes itself; leave it out, or choose another one")
     return stamp_of(database)
 

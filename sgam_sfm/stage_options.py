@@ -150,3 +150,21 @@ class ExportOptions:
     """Folder for the files; made when missing."""
     images: Path | None = None
     """Folder of the images, where it is no longer the one that the run was given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JoinOptions:
+    """The shards of a run (`match --shard i/n`) put together: the output of the same run without shards.
+
+    Checks that all blocks of pairs are there, then merges the points into keypoints and writes database.db, verifies
+    and maps with the options of the shards. Nothing is matched again.
+    """
+
+    shards: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SHARD_OUT...")]
+    """The --output folders of all shards."""
+    output: Path
+    """Folder for all results; made when missing."""
+    images: Path | None = None
+    """Folder of the images, where it is no longer the one that the shards were given."""
+    verbose: bool = False
+    """Show the log on the terminal; it is always in OUT/log.txt."""

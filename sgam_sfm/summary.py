@@ -127,6 +127,19 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     console.print(table)
 
 
+def print_shard(summary: Mapping[str, Any], console: Console) -> None:
+    """A table for the terminal of what a shard did."""
+    pairs, shard = summary["pairs"], summary["shard"]
+    table = Table(show_header=False, box=None)
+    table.add_row("shard", f"{shard['shard']}, {shard['blocks']} blocks of pairs")
+    table.add_row("images", f"{summary['images']['used']} in all shards, {len(summary['images']['failed'])} failed")
+    table.add_row("pairs", f"{pairs['matched']} of {pairs['listed']} matched, {len(pairs['failed'])} failed")
+    table.add_row("matches", f"{pairs['raw_matches']} raw")
+    table.add_row("next", "once all shards are done: sgam-sfm join SHARD_OUT... --output OUT")
+    table.add_row("time", _told_seconds(summary))
+    console.print(table)
+
+
 def print_models(content: Mapping[str, Any], console: Console) -> None:
     """A table for the terminal of what `reconstruct` or `aggregate` made."""
     table = Table(show_header=False, box=None)
@@ -147,4 +160,8 @@ def _add_models(content: Mapping[str, Any], table: Table) -> None:
         )
     if not content["models"]:
         table.add_row("model", content["no_model"])
-    table.add_row("time", ", ".join(f"{name.lower()} {value:.0f} s" for name, value in content["seconds"].items()))
+    table.add_row("time", _told_seconds(content))
+
+
+def _told_seconds(content: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name.lower()} {value:.0f} s" for name, value in content["seconds"].items())

@@ -17,19 +17,21 @@ def run(options: MatchOptions, console: Console) -> int:
     from sgam_sfm.inputs import refuse_among_images
     from sgam_sfm.progress import Stages
     from sgam_sfm.runner import match_collection
-    from sgam_sfm.summary import print_summary
+    from sgam_sfm.summary import print_shard, print_summary
 
     refuse_unused_script(options, "matcher")
     refuse_unused_script(options, "segmenter")
     refuse_among_images(options.output, options.images)  # before the log is begun there
     with logging_to(options.output / "log.txt", console, verbose=options.verbose, as_json=options.log_json):
         summary = match_collection(options, Stages(console=console))
-        print_summary(summary, console)
+        (print_shard if options.shard else print_summary)(summary, console)
     return exit_code(summary, options)
 
 
 def exit_code(summary: dict[str, Any], options: MatchOptions) -> int:
     """What a finished run tells the shell."""
+    if options.shard:
+        return DONE  # what failed is told by `join`, and must not keep a job scheduler from starting it
     if options.mapping and not summary["models"]:
         return NO_MODEL
     failed = summary["images"]["failed"] or summary["pairs"]["failed"] or summary["pairs"]["of_unusable_images"]

@@ -37,5 +37,10 @@ class CompareOptions(MatchOptions):
     """The longest side of a whole image that memory allows a method with a budget."""
 
     def __post_init__(self) -> None:
+        MatchOptions.__post_init__(self)
+        if self.executor != "local" or self.shard:
+            raise OptionError(
+                "--executor ray and --shard are for `sgam-sfm match`; leave them out: compare is one process"
+            )
         if self.database is not None or self.append:
             raise OptionError("--database and --append are for `sgam-sfm match`; compare makes its own")

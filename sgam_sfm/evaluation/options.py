@@ -33,6 +33,11 @@ class EvaluateOptions(MatchOptions):
     """Angles of the pose AUC (the paper: 5, 10, 20)."""
 
     def __post_init__(self) -> None:
+        MatchOptions.__post_init__(self)
+        if self.executor != "local" or self.shard:
+            raise OptionError(
+                "--executor ray and --shard are for `sgam-sfm match`; leave them out: evaluate is one process"
+            )
         if self.database is not None or self.append:
             raise OptionError("--database and --append are for `sgam-sfm match`; evaluate writes to no database")
 

@@ -43,7 +43,7 @@ def finished(tmp_path_factory) -> Path:
 @pytest.fixture
 def photos(tmp_path: Path, monkeypatch) -> Path:
     """A folder of new photos, and a point matcher that knows what they show."""
-    monkeypatch.setattr("sgam_sfm.localization.create_matcher", lambda options: ArcMatcher(ARC | NEW | AWAY))
+    monkeypatch.setattr("sgam_sfm.executors.local.create_matcher", lambda options: ArcMatcher(ARC | NEW | AWAY))
     return write_arc(tmp_path / "new", NEW) / "images"
 
 

@@ -1,0 +1,54 @@
+"""Blocks of pairs matched by this process, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sgam_core import PointMatcher
+from sgam_sfm.executors import Begin, MatchingJob
+from sgam_sfm.machine import find_device, use_threads
+from sgam_sfm.matching import CollectionMatcher, create_matcher, failed_record
+from sgam_sfm.options import MatchOptions
+from sgam_sfm.pairs import Pair
+from sgam_sfm.progress import Advance
+from sgam_sfm.store import PairRecord
+from sgam_sfm.supervision import given_up
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LocalExecutor:
+    """See `sgam_sfm.executors.Executor`."""
+
+    device: str
+    point_matcher: PointMatcher
+
+    @property
+    def own_device(self) -> str:
+        return self.device
+
+    @staticmethod
+    def of(options: MatchOptions, point_matcher: PointMatcher | None = None) -> LocalExecutor:
+        """The device, threads and point matcher of the options. Raises: OptionError for what cannot be used."""
+        device = str(find_device(options.device, "--device"))
+        use_threads(options.threads)
+        point_matcher = point_matcher or create_matcher(replace(options, device=device))
+        return LocalExecutor(device=device, point_matcher=point_matcher)
+
+    def run(
+        self, job: MatchingJob, blocks: Sequence[tuple[int, Sequence[Pair]]], advance: Advance, begin: Begin
+    ) -> Iterator[tuple[int, Sequence[PairRecord]]]:
+        matcher = CollectionMatcher(job.options, job.inputs, job.labels, self.point_matcher)
+        for number, block in blocks:
+            matcher.start_block()
+            records = []
+            for pair in block:
+                begin(pair)
+                reason = given_up(pair)
+                records.append(failed_record(pair, reason) if reason else matcher.match(pair))
+                advance(1)
+            yield number, records
+
+    def facts(self) -> dict[str, Any]:
+        return {"name": "local"}
