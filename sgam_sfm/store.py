@@ -1,13 +1,16 @@
 """Raw pair results on disk, one HDF5 file per block of pairs: the unit of work and of resume.
 
 A block's file appears under its name only when it is whole, so that a block either counts as done or is done again.
+The matches of its pairs follow each other in one array per field: HDF5 needs about as long for an array of one pair as
+for one of thousands of matches.
 
     pairs/00000.h5          attributes: fingerprint
-      /0, /1, ...           one group a pair, in the block's order
-         attributes         name0, name1, error and fallback (empty: none)
-         facts              areas, two-view geometry, ... as JSON
-         points0, points1   (M, 2) float32 pixels, corner origin
-         scores, sigmas0, sigmas1, area_index  (M,)
+      facts                 JSON: for every pair its names, error, fallback, areas, two-view geometry, ...
+      ends                  (P,) the row after the last match of every pair
+      points0, points1      (M, 2) float32 pixels, corner origin
+      scores, sigmas0, sigmas1, area_index  (M,)
+
+Files of one group a pair, as they were written before, are read too.
 """
 
 from __future__ import annotations
@@ -71,16 +74,14 @@ class PairStore:
         content = io.BytesIO()  # HDF5 ends the process when it closes a file that the disk has no room for
         with h5py.File(content, "w", track_order=True) as file:
             file.attrs["fingerprint"] = self.fingerprint
-            for index, record in enumerate(records):
-                _write_record(file.create_group(str(index)), record)
+            _write_records(file, records)
         with replacing(self.path(block)) as partial:
             partial.write_bytes(content.getbuffer())
 
     def read(self, block: int) -> Iterator[PairRecord]:
         """The records of a block, in its order."""
         with h5py.File(self.path(block), "r") as file:
-            for index in range(len(file)):
-                yield _read_record(file[str(index)])
+            yield from _read_records(file)
 
     def read_all(self, blocks: int) -> Iterator[PairRecord]:
         """The records of blocks 0, 1, ... in order, one block in memory at a time."""
@@ -88,25 +89,28 @@ class PairStore:
             yield from self.read(block)
 
 
-def _write_record(group: h5py.Group, record: PairRecord) -> None:
-    group.attrs["name0"], group.attrs["name1"] = record.pair
-    group.attrs["error"] = record.error
-    result = record.result
-    if result is None:
-        return
-    group.attrs["fallback"] = result.fallback
-    group.create_dataset("facts", data=json.dumps(_facts(result)))
+def _write_records(file: h5py.File, records: Sequence[PairRecord]) -> None:
+    told = [
+        {"pair": record.pair, "error": record.error} | ({} if record.result is None else _facts(record.result))
+        for record in records
+    ]
+    parts = [Matches.empty() if record.result is None else record.result.matches for record in records]
+    file.create_dataset("facts", data=np.frombuffer(json.dumps(told).encode(), np.uint8))
+    file.create_dataset("ends", data=np.cumsum([len(part) for part in parts], dtype=np.int64))
+    joined = Matches.concatenate(parts)
     for name in _ARRAYS:
-        array = getattr(result.matches, name)
+        array = getattr(joined, name)
         array = array.astype(np.float32) if array.dtype == np.float64 else array
-        group.create_dataset(name, data=array, compression="lzf" if len(array) else None)
+        # Points are as good as random: packing them costs time and saves nothing.
+        pack = bool(len(array)) and not name.startswith("points")
+        file.create_dataset(name, data=array, compression="lzf" if pack else None)
 
 
 def _facts(result: PairResult) -> dict[str, Any]:
-    """A result but for its matches, fallback and times (times differ between runs, a block's content does not)."""
+    """A result but for its matches and times (times differ between runs, a block's content does not)."""
     facts = {
         name: getattr(result, name)
-        for name in ("coverage0", "coverage1", "whole_scale0", "whole_scale1", "notes", "pixels_matched")
+        for name in ("fallback", "coverage0", "coverage1", "whole_scale0", "whole_scale1", "notes", "pixels_matched")
     }
     model = result.two_view
     two_view = None if model is None else {name: getattr(model, name) for name in TwoViewModel.__slots__}
@@ -116,22 +120,55 @@ def _facts(result: PairResult) -> dict[str, Any]:
     return to_jsonable_python(facts)
 
 
-def _read_record(group: h5py.Group) -> PairRecord:
-    pair = (str(group.attrs["name0"]), str(group.attrs["name1"]))
+def _read_records(file: h5py.File) -> Iterator[PairRecord]:
+    if "facts" not in file:
+        yield from map(_read_group, _groups(file))
+        return
+    arrays = {name: file[name][()] for name in _ARRAYS}
+    begin = 0
+    for told, end in zip(_read_facts(file), file["ends"][()].tolist(), strict=True):
+        yield _record(told, {name: array[begin:end] for name, array in arrays.items()})
+        begin = end
+
+
+def _read_facts(file: h5py.File) -> list[dict[str, Any]]:
+    """What a block tells of its pairs but for their matches."""
+    facts: list[dict[str, Any]] = json.loads(file["facts"][()].tobytes())
+    return facts
+
+
+def _read_group(group: h5py.Group) -> PairRecord:
+    told = _told_of(group)
+    if told["error"]:
+        return _record(told, {})
+    return _record(told | json.loads(group["facts"][()]), {name: group[name][()] for name in _ARRAYS})
+
+
+def _groups(file: h5py.File) -> list[h5py.Group]:
+    """The groups of a file that has one for every pair, in their order."""
+    return [file[str(index)] for index in range(len(file))]
+
+
+def _told_of(group: h5py.Group) -> dict[str, Any]:
+    names = [str(group.attrs[name]) for name in ("name0", "name1")]
     error = str(group.attrs["error"])
+    return {"pair": names, "error": error, "fallback": "" if error else str(group.attrs["fallback"])}
+
+
+def _record(told: dict[str, Any], arrays: dict[str, np.ndarray]) -> PairRecord:
+    pair, error = (told["pair"][0], told["pair"][1]), told["error"]
     if error:
         return PairRecord(pair=pair, result=None, error=error)
-    facts = json.loads(group["facts"][()])
+    facts = {name: value for name, value in told.items() if name not in ("pair", "error")}
     two_view = facts.pop("two_view")
     if two_view is not None:
         two_view = TwoViewModel(**(two_view | {"F": np.array(two_view["F"])}))
     return PairRecord(
         pair=pair,
         result=PairResult(
-            matches=Matches(**{name: group[name][()] for name in _ARRAYS}),
+            matches=Matches(**arrays),
             areas=_AREAS.validate_python(facts.pop("areas")),
             two_view=two_view,
-            fallback=str(group.attrs["fallback"]),
             **(facts | {"notes": tuple(facts["notes"])}),
         ),
     )
@@ -161,9 +198,10 @@ def read_pair_outcomes(output: Path) -> Iterator[PairOutcome]:
     for path in sorted((output / "pairs").glob("*.h5")):
         try:
             with h5py.File(path, "r") as file:
-                for group in file.values():
-                    name0, name1, error = (str(group.attrs[name]) for name in ("name0", "name1", "error"))
-                    fallback = "" if error else str(group.attrs["fallback"])
-                    yield PairOutcome(pair=(name0, name1), block=int(path.stem), error=error, fallback=fallback)
+                found = _read_facts(file) if "facts" in file else [_told_of(group) for group in _groups(file)]
+                for told in found:
+                    name0, name1 = told["pair"]
+                    fallback = told.get("fallback", "")
+                    yield PairOutcome(pair=(name0, name1), block=int(path.stem), error=told["error"], fallback=fallback)
         except (OSError, KeyError, ValueError) as reason:
             raise InputError(f"'{path}' is not a file of pair results; remove it and start the run again") from reason
