@@ -10,7 +10,7 @@ from typing import Any
 from sgam_core import PointMatcher
 from sgam_core.errors import OptionError
 from sgam_sfm.appending import Stamp, append_to_database, replace_database, stamp_of
-from sgam_sfm.assembly import build_models, merge_records, verify_pairs
+from sgam_sfm.assembly import build_models, merged_records, verify_pairs, write_for_hloc
 from sgam_sfm.database import write_database
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import Inputs, read_inputs
@@ -24,7 +24,7 @@ from sgam_sfm.pairs import blocks
 from sgam_sfm.progress import Stages
 from sgam_sfm.run_record import recording
 from sgam_sfm.store import PairStore
-from sgam_sfm.summary import summarise_images, summarise_keypoints, summarise_pairs, versions
+from sgam_sfm.summary import CountedPairs, summarise_images, summarise_keypoints, summarise_pairs, versions
 
 KNOWN_CAMERAS = "known_cameras"
 """In inputs.json: the images whose camera the user gave."""
@@ -60,17 +60,19 @@ def _match_collection(options: MatchOptions, stages: Stages, point_matcher: Poin
     steps = match_blocks(work, store, matcher, stages)
 
     with stages.stage("Merging keypoints", None):
-        records = list(store.read_all(len(work)))
-        merged = merge_records(records, options.keypoints, options.geometry.max_residual, output)
-        write = write_database if existing is None else append_to_database
-        write(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
+        counted = CountedPairs(store.read_all(len(work)))
+        with merged_records(counted, options.keypoints, options.geometry.max_residual, output) as merged:
+            write = write_database if existing is None else append_to_database
+            write(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
+            write_for_hloc(merged, output)
+            keypoints = summarise_keypoints(merged)
     verified, mapped = reconstruct(options, inputs, stages, existing)
 
     summary = {
         "images": summarise_images(inputs),
-        "pairs": summarise_pairs(inputs, records, verified),
+        "pairs": summarise_pairs(inputs, counted, verified),
         "labels": {} if labels is None else {"failed": labels.set.failed, **labels.set.facts},
-        "keypoints": summarise_keypoints(merged),
+        "keypoints": keypoints,
         "models": [] if mapped is None else mapped.models,
         "no_model": "mapping was not asked for (--no-mapping)" if mapped is None else mapped.reason,
         "seconds": stages.seconds,

@@ -1,12 +1,12 @@
 import itertools
-from unittest import mock
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sgam_core.types import Matches
-from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions, merge_keypoints
+from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions
+from sgam_sfm.merging import merge_keypoints
 from sgam_sfm.tracks import Tracks
 
 NAMES = ("a", "b", "c", "d")
@@ -138,16 +138,15 @@ def one_after_the_other(points, images, sigmas, edges, radius):
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_joining_at_once_is_joining_one_after_the_other(seed):
+def test_joining_is_what_it_says(seed):
     rng = np.random.default_rng(seed)
     count, num_images, num_edges = (int(rng.integers(1, top)) for top in (60, 8, 120))
     points, images = rng.uniform(0, rng.choice([5, 20, 100]), (count, 2)), rng.integers(0, num_images, count)
     sigmas, radius = rng.choice([1.0, 1.0, 2.0], count), float(rng.choice([0, 2, 5]))
     edges, half = rng.integers(0, count, (num_edges, 2)), num_edges // 2
     made = Tracks(points, images, sigmas, radius)
-    with mock.patch("sgam_sfm.tracks._EDGES_AT_ONCE", int(rng.integers(1, 100))):
-        made.join(edges[:half])
-        made.join(edges[half:], min_shared=1)
+    made.join(edges[:half])
+    made.join(edges[half:], min_shared=1)
     needed = [(a, b, int(row >= half)) for row, (a, b) in enumerate(edges.tolist())]
     root, stands = one_after_the_other(points, images, sigmas, needed, radius)
     np.testing.assert_array_equal(made.track(), root)
