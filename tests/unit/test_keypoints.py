@@ -4,7 +4,7 @@ import pytest
 from sgam_core.errors import InputError, OptionError, ShapeError
 from sgam_core.types import Matches
 from sgam_sfm.affine import local_affine
-from sgam_sfm.alignment import align_keypoints
+from sgam_sfm.alignment import align_keypoints, offsets_of
 from sgam_sfm.clusters import merge_image
 from sgam_sfm.keypoints import KeypointOptions
 from sgam_sfm.merging import merge_keypoints
