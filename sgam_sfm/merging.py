@@ -35,7 +35,7 @@ import numpy as np
 from sgam_core.errors import InputError, ShapeError
 from sgam_core.types import Matches
 from sgam_sfm.affine import local_affine
-from sgam_sfm.alignment import align_keypoints, offsets_of
+from sgam_sfm.alignment import offsets_of
 from sgam_sfm.clusters import finest_and_weight, merge_image
 from sgam_sfm.compiled import compiled
 from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions
@@ -137,9 +137,7 @@ def merging(
     with Scratch(output / _FOLDER) as scratch:
         raw = _collect(pairs, scratch)
         bounds, told = _merge_images(raw, options.cluster_radius_px, scratch)
-        images = np.repeat(np.arange(len(raw.names), dtype=np.int32), np.diff(bounds))
-        tracks = Tracks(told[:, :2], images, told[:, 2], options.track_radius_px, told[:, 3])
-        del told, images
+        tracks = Tracks.of_images(bounds, told.read, options.track_radius_px)
         for edges in _strongest_first(raw, scratch):
             tracks.join(edges)
         if options.track_radius_px > 0 and options.min_shared_images > 0:
@@ -207,8 +205,8 @@ def _weights(rows: np.ndarray) -> np.ndarray:
     return np.maximum(rows[:, _SCORE], np.float32(_MIN_WEIGHT))
 
 
-def _merge_images(raw: _Raw, radius_px: float, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
-    """Where the keypoints of every image begin (N + 1,), and place, finest sigma and weight of all, float32 (K, 4)."""
+def _merge_images(raw: _Raw, radius_px: float, scratch: Scratch) -> tuple[np.ndarray, Rows]:
+    """Where the keypoints of every image begin (N + 1,), and of all place, finest sigma and weight (K, 4)."""
     sides: list[list[tuple[int, int, int]]] = [[] for _ in raw.names]
     for pair in raw.pairs:
         sides[pair.image0].append((0, pair.begin, pair.length))
@@ -220,8 +218,8 @@ def _merge_images(raw: _Raw, radius_px: float, scratch: Scratch) -> tuple[np.nda
         sigmas = np.concatenate([rows[:, 4 + side] for side, rows in parts])
         weights = np.concatenate([_weights(rows) for _, rows in parts])
         merged, labels = merge_image(points, sigmas, weights, radius_px)
-        told = finest_and_weight(labels, sigmas, weights, len(merged), _OCTAVE)
-        return image, np.column_stack([merged, *told]), labels
+        finest = finest_and_weight(labels, sigmas, weights, len(merged), _OCTAVE)
+        return image, np.column_stack([merged, *finest]), labels
 
     told = scratch.rows("merged.rows", 4, np.float32)
     bounds = np.zeros(len(raw.names) + 1, np.int64)
@@ -233,7 +231,7 @@ def _merge_images(raw: _Raw, radius_px: float, scratch: Scratch) -> tuple[np.nda
             begin_of_labels += count
         told.append(keypoints)
         bounds[image + 1] = told.count
-    return bounds, told.read(0, told.count)
+    return bounds, told
 
 
 def _strongest_first(raw: _Raw, scratch: Scratch) -> Iterator[np.ndarray]:
@@ -342,30 +340,20 @@ def _align(raw: _Raw, tracks: Tracks, scratch: Scratch) -> int:
         parts.put((hashed * num_parts >> np.uint64(32)).astype(np.int64), rows)
         num_linked += len(rows)
 
-    def solve(part: int) -> tuple[np.ndarray, np.ndarray]:
+    def solve(part: int) -> None:
         rows = parts.take_label(part)
         numbers = rows.view(np.int32)
-        members, index = np.unique(numbers[:, :2], return_inverse=True)
-        moved = align_keypoints(
-            tracks.points(members),
-            tracks.sigmas(members),
-            index.reshape(-1, 2),
-            numbers[:, 2],
-            rows[:, 8:10],
-            rows[:, 3:7].reshape(-1, 2, 2),
-            rows[:, 7],
-        )
-        return members, moved
+        tracks.align(numbers[:, :2], numbers[:, 2], rows[:, 8:10], rows[:, 3:7], rows[:, 7])
 
-    for members, moved in in_order(solve, parts.finish()):
-        tracks.move(members, moved)
+    for _ in in_order(solve, parts.finish()):
+        pass
     return num_matches - num_linked
 
 
 def _offsets(tracks: Tracks, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
     points = tracks.points(index.ravel())
     places = np.arange(2 * len(index)).reshape(-1, 2)
-    return offsets_of(points, places, rows[:, _POINTS], rows[:, _AFFINE].reshape(-1, 2, 2))
+    return offsets_of(points, places, rows[:, _POINTS], rows[:, _AFFINE])
 
 
 def _export(
@@ -386,24 +374,22 @@ def _export(
         return found
 
     matches, scores = scratch.rows("merged_matches.rows", 2, np.int32), scratch.rows("scores.rows", 1, np.float32)
-    used = np.zeros(int(bounds[-1]), bool)
     begins = [0]
     num_agreeing = 0
     for found in in_order(agreeing, _batches(raw)):
         for index, best, count in found:
-            used[index] = True
+            tracks.mark_used(index)
             num_agreeing += count
             begins.append(begins[-1] + len(best))
         matches.append(np.concatenate([index for index, _, _ in found]))
         scores.append(np.concatenate([best for _, best, _ in found])[:, None])
-    number = np.cumsum(used, dtype=np.int32) - 1
-    first = np.concatenate([[0], np.cumsum(used)])[bounds]  # of every image, among those used
-    keypoints = scratch.rows("keypoints.rows", 2, np.float32)
+    keypoints, first = scratch.rows("keypoints.rows", 2, np.float32), [0]
     for begin, end in pairwise(bounds.tolist()):
-        keypoints.append(tracks.points(np.flatnonzero(used[begin:end]) + begin))
+        keypoints.append(tracks.points(tracks.number_used(begin, end)))
+        first.append(keypoints.count)
     filled = [pair for pair in raw.pairs if pair.length]
     for pair, (begin, end) in zip(filled, pairwise(begins), strict=True):
-        rows = number[matches.read(begin, end - begin)] - first[[pair.image0, pair.image1]]
+        rows = tracks.number(matches.read(begin, end - begin))
         matches.write(begin, rows if pair.pair[0] < pair.pair[1] else rows[:, ::-1])
     where = {pair.pair: row for row, pair in enumerate(filled)}
     empty = [pair.pair for pair in raw.pairs if not pair.length]
@@ -417,7 +403,7 @@ def _export(
     return CollectionKeypoints(
         keypoints=OnDisk(
             {name: row for row, name in enumerate(raw.names)},
-            lambda row: keypoints.read(int(first[row]), int(first[row + 1] - first[row])),
+            lambda row: keypoints.read(first[row], first[row + 1] - first[row]),
         ),
         matches=OnDisk(where, matches_of),
         scores=OnDisk(where, lambda row: scores.read(begins[row], begins[row + 1] - begins[row])[:, 0]),

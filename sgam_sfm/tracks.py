@@ -5,9 +5,13 @@ Keypoints of the whole collection are numbered 0..K-1, image by image.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import pairwise
+
 import numpy as np
 from jaxtyping import Float, Int
 
+from sgam_sfm.alignment import align_keypoints
 from sgam_sfm.compiled import compiled
 from sgam_sfm.grid import cells_around, grid_of
 
@@ -34,15 +38,37 @@ class Tracks:
         radius: float,
         weights: np.ndarray | None = None,
     ) -> None:
-        self._rows = np.empty((len(images), _COLUMNS), np.int32)
+        self._begin(len(images), int(images.max(initial=-1)) + 1, radius)
+        self._fill(0, points, images, sigmas, np.ones(len(images)) if weights is None else weights)
+
+    @classmethod
+    def of_images(cls, bounds: np.ndarray, keypoints: Callable[[int, int], np.ndarray], radius: float) -> Tracks:
+        """The same for keypoints that are read image by image.
+
+        Args: bounds: (N + 1,) where those of each image begin. keypoints: place, sigma and weight (n, 4) of a number of
+            keypoints from one on.
+        """
+        tracks = cls.__new__(cls)
+        tracks._begin(int(bounds[-1]), len(bounds) - 1, radius)
+        for image, (begin, end) in enumerate(pairwise(bounds.tolist())):
+            told = keypoints(begin, end - begin)
+            tracks._fill(begin, told[:, :2], np.full(end - begin, image), told[:, 2], told[:, 3])
+        return tracks
+
+    def _begin(self, count: int, num_images: int, radius: float) -> None:
+        self._rows = np.empty((count, _COLUMNS), np.int32)
         self._values = self._rows.view(np.float32)
-        numbers = np.arange(len(images), dtype=np.int32)
-        self._rows[:, _PARENT], self._rows[:, _IMAGE] = -1, images
-        self._rows[:, _NEXT] = self._rows[:, _STANDS] = numbers
-        self._values[:, _X : _Y + 1], self._values[:, _SIGMA] = points, sigmas
-        self._values[:, _WEIGHT] = 1 if weights is None else weights
+        self._stamps = np.full(num_images, -1, np.int32)
         self._radius = radius
-        self._stamps = np.full(int(images.max(initial=-1)) + 1, -1, np.int32)
+
+    def _fill(
+        self, begin: int, points: np.ndarray, images: np.ndarray, sigmas: np.ndarray, weights: np.ndarray
+    ) -> None:
+        here = slice(begin, begin + len(images))
+        self._rows[here, _PARENT], self._rows[here, _IMAGE] = -1, images
+        self._rows[here, _NEXT] = self._rows[here, _STANDS] = np.arange(here.start, here.stop)
+        self._values[here, _X : _Y + 1], self._values[here, _SIGMA] = points, sigmas
+        self._values[here, _WEIGHT] = weights
 
     def track(self, keypoints: np.ndarray | None = None) -> Int[np.ndarray, " K"]:
         """The keypoint that gives each of some keypoints' track its number; of all when left out."""
@@ -56,14 +82,6 @@ class Tracks:
         """Where keypoints lie."""
         return self._values[keypoints, _X : _Y + 1].astype(np.float64)
 
-    def sigmas(self, keypoints: np.ndarray | slice) -> Float[np.ndarray, " K"]:
-        """Image pixels per matcher pixel of the finest of their points."""
-        return self._values[keypoints, _SIGMA].astype(np.float64)
-
-    def move(self, keypoints: np.ndarray, points: np.ndarray) -> None:
-        """Put keypoints elsewhere."""
-        self._values[keypoints, _X : _Y + 1] = points
-
     def join(self, edges: Int[np.ndarray, "E 2"], min_shared: int = 0) -> None:
         """Make one track of those of each edge's keypoints, unless that needs one keypoint at two distant spots.
 
@@ -74,11 +92,36 @@ class Tracks:
         _join(self._rows, self._values, self._stamps, edges, self._radius, min_shared)
 
     def settle(self, octave: float) -> None:
-        """Put every standing keypoint to the mean of those that became part of it, by weight.
+        """End joining: put every standing keypoint to the mean of those that became part of it, by weight.
 
         octave: those whose sigma is so many times its own have no say.
         """
         _settle(self._rows, self._values, octave)
+        self._rows[:, _NEXT] = -1
+
+    def align(
+        self, index: np.ndarray, tracks: np.ndarray, offsets: np.ndarray, affine: np.ndarray, weights: np.ndarray
+    ) -> None:
+        """Move the keypoints of whole tracks to where their matches agree, once they are settled.
+
+        See `align_keypoints`.
+        """
+        points, sigmas, slots = self._values[:, _X : _Y + 1], self._values[:, _SIGMA], self._rows[:, _NEXT]
+        align_keypoints(points, sigmas, slots, index, tracks, offsets, affine, weights)
+
+    def mark_used(self, keypoints: np.ndarray) -> None:
+        """Mark keypoints as used, once all are aligned."""
+        self._rows[keypoints, _NEXT] = 0
+
+    def number_used(self, begin: int, end: int) -> Int[np.ndarray, " N"]:
+        """The used ones among the keypoints of an image, which are numbered 0, 1, ... from now on."""
+        used = np.flatnonzero(self._rows[begin:end, _NEXT] >= 0) + begin
+        self._rows[used, _NEXT] = np.arange(len(used))
+        return used
+
+    def number(self, keypoints: np.ndarray) -> Int[np.ndarray, " *_"]:
+        """The numbers of used keypoints in their images."""
+        return self._rows[keypoints, _NEXT]
 
     def side_by_side(self, begin: int, end: int) -> tuple[Int[np.ndarray, "T 2"], Float[np.ndarray, " T"]]:
         """Pairs of tracks, smaller number first, with keypoints of one image within the radius, and their distances.

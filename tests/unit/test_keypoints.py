@@ -164,13 +164,15 @@ def test_local_affine_of_three_matches_is_the_identity():
 
 def test_align_keypoints_weighs_by_variance_and_carries_matches_along_the_affine_map():
     # x1 = 5 + 2 (x0 - 1) with x0 held at 1.5 by a hundredfold weight of its own point: x1 = 6.
-    start, index, affine = np.array([[1.5, 0.0], [5.0, 0.0]]), np.array([[0, 1]]), 2 * np.eye(2)[None]
-    match = np.array([[1.0, 0.0, 5.0, 0.0]])
-    offsets = offsets_of(start, index, match, affine)
+    keypoints, index, affine = np.array([[1.5, 0.0], [5.0, 0.0]]), np.array([[0, 1]]), np.array([[2.0, 0.0, 0.0, 2.0]])
+    match, slots = np.array([[1.0, 0.0, 5.0, 0.0]]), np.full(2, -1)
+    offsets = offsets_of(keypoints, index, match, affine)
     np.testing.assert_allclose(offsets, [[-1.0, 0.0]])
-    aligned = align_keypoints(start, np.array([1e-3, 1e3]), index, np.array([0]), offsets, affine, np.array([1.0]))
-    np.testing.assert_allclose(aligned, [[1.5, 0.0], [6.0, 0.0]], atol=1e-3)
-    np.testing.assert_allclose(offsets_of(aligned, index, match, affine), [[0.0, 0.0]], atol=1e-3)
+    sigmas, track, weight = np.array([1e-3, 1e3]), np.array([7]), np.array([1.0])
+    align_keypoints(keypoints, sigmas, slots, index, track, offsets, affine, weight)
+    np.testing.assert_allclose(keypoints, [[1.5, 0.0], [6.0, 0.0]], atol=1e-3)
+    np.testing.assert_allclose(offsets_of(keypoints, index, match, affine), [[0.0, 0.0]], atol=1e-3)
+    np.testing.assert_array_equal(slots, [-1, -1])
 
 
 def test_empty_pairs_and_an_empty_collection_give_empty_keypoints():
