@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from sgam_core.geometry import residuals
 from sgam_sfm.colmap_reading import read_camera_ids, read_counts, read_match_counts
-from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
+from sgam_sfm.hloc_files import matches_h5_size, write_keypoints_h5, write_matches_h5
 from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions
 from sgam_sfm.mapping import (
     MappingOptions,
@@ -24,6 +25,10 @@ from sgam_sfm.mapping import (
 from sgam_sfm.merging import RawPair, merging
 from sgam_sfm.progress import Advance, Stages
 from sgam_sfm.store import PairRecord
+
+_log = logging.getLogger(__name__)
+
+_LARGEST_MATCHES_H5 = 2**31  # bytes
 
 
 @contextmanager
@@ -47,11 +52,25 @@ def _raw_pair(record: PairRecord, max_residual: float) -> RawPair:
     return record.pair, matches, None if model is None else residuals(model.F, matches) <= max_residual
 
 
-def write_for_hloc(merged: CollectionKeypoints, output: Path) -> None:
-    """OUT/keypoints.h5 and OUT/matches.h5."""
+def write_for_hloc(merged: CollectionKeypoints, output: Path, *, large: bool = False) -> None:
+    """OUT/keypoints.h5 and OUT/matches.h5.
+
+    The latter has a group for every pair and a number for every keypoint of its first image, matched or not. When that
+    is many times the database, it is left out unless `large`, and an older one is removed, since it would be taken for
+    it.
+    """
     write_keypoints_h5(output / "keypoints.h5", merged.keypoints)
     counts = {name: len(points) for name, points in merged.keypoints.items()}
-    write_matches_h5(output / "matches.h5", merged.matches, merged.scores, counts)
+    size, path = matches_h5_size(merged.matches, counts), output / "matches.h5"
+    if size > _LARGEST_MATCHES_H5 and not large:
+        _log.warning(
+            "%s is left out: in hloc's layout the matches of %d pairs take about %.1f GB; if you need it, "
+            "`sgam-sfm aggregate '%s' --hloc` writes it (the database is whole)",
+            *(path.name, len(merged.matches), size / 1e9, output),
+        )
+        path.unlink(missing_ok=True)
+        return
+    write_matches_h5(path, merged.matches, merged.scores, counts)
 
 
 def verify_pairs(

@@ -21,6 +21,7 @@ from sgam_sfm.pairs import Pair
 
 _log = logging.getLogger(__name__)
 
+_GROUP_BYTES = 1500  # a pair, before its arrays
 _H5_OVERHEAD = 8192  # bytes a group, generously: on a full disk HDF5 ends the process instead of raising an error
 
 
@@ -37,6 +38,11 @@ def write_keypoints_h5(path: Path, keypoints: Mapping[str, np.ndarray]) -> None:
             if points.ndim != 2 or points.shape[1] != 2:
                 raise ShapeError(f"keypoints of '{name}' have shape {points.shape}; expected (N, 2)")
             file[f"{name}/keypoints"] = (np.asarray(points, np.float64) - 0.5).astype(np.float32)
+
+
+def matches_h5_size(pairs: Iterable[Pair], keypoint_counts: Mapping[str, int]) -> int:
+    """About how many bytes a matches file takes."""
+    return sum(_GROUP_BYTES + 6 * keypoint_counts[pair[0]] for pair in pairs)
 
 
 def write_matches_h5(

@@ -267,7 +267,8 @@ def _strengths(index: np.ndarray, weights: np.ndarray, variances: np.ndarray) ->
         while place < len(order) and keys[order[place]] == key:
             variance = np.float64(variances[order[place]])
             support += np.float64(weights[order[place]]) / abs(variance)
-            num_inliers += variance > 0
+            if variance > 0:
+                num_inliers += 1
             place += 1
         edges[count, 0], edges[count, 1] = key >> 32, key & 0xFFFFFFFF
         octave = np.floor(np.log2(support))

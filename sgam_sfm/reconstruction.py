@@ -58,7 +58,7 @@ def aggregate(options: AggregateOptions, stages: Stages | None = None) -> dict[s
             records, limit = read_pairs_of(folder), run.geometry.max_residual
             with merged_records(records, options.keypoints, limit, source.output) as merged:
                 write_database(source.written, folder / "cameras.db", merged.keypoints, merged.matches)
-                write_for_hloc(merged, source.output)
+                write_for_hloc(merged, source.output, large=options.hloc)
                 content: dict[str, Any] = {"keypoints": summarise_keypoints(merged)}
         content |= _verify_and_map(options, source, stages, anew=True, mapping=options.mapping)
         source.keep({"keypoints": asdict(options.keypoints)}, content)
