@@ -14,4 +14,4 @@ Function = TypeVar("Function", bound=Callable)
 def compiled(function: Function) -> Function:
     """The function as machine code that lets other threads run meanwhile; arguments are arrays and numbers."""
     # What checks the shapes of arguments in tests wraps functions, and cannot be compiled.
-    return cast(Function, numba.njit(cache=True, nogil=True)(inspect.unwrap(function)))
+    return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function)))

@@ -278,16 +278,20 @@ def _settle(rows: np.ndarray, values: np.ndarray, octave: float) -> None:
 def _near_tracks(
     rows: np.ndarray, values: np.ndarray, begin: int, end: int, radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    coarsest = np.float64(0.0)
+    coarsest, count = np.float64(0.0), 0
+    standing, roots = np.empty(end - begin, np.int64), np.empty(end - begin, np.int64)
     points = np.empty((end - begin, 2))
-    roots = np.empty(end - begin, np.int64)
     for keypoint in range(begin, end):
+        if rows[keypoint, _STANDS] != keypoint:
+            continue
         coarsest = max(coarsest, np.float64(values[keypoint, _SIGMA]))
-        points[keypoint - begin, 0], points[keypoint - begin, 1] = values[keypoint, _X], values[keypoint, _Y]
+        points[count, 0], points[count, 1] = values[keypoint, _X], values[keypoint, _Y]
         root = keypoint
         while rows[root, _PARENT] >= 0:
             root = rows[root, _PARENT]
-        roots[keypoint - begin] = root
+        standing[count], roots[count] = keypoint, root
+        count += 1
+    points = points[:count]
     widest = radius * coarsest
     frame, start, order = grid_of(points, widest / 2)
     lines = int(frame[4])
@@ -298,9 +302,10 @@ def _near_tracks(
         for column in range(left, right):
             for place in range(start[column * lines + top], start[column * lines + bottom]):
                 other = order[place]
-                if other <= one or roots[one] == roots[other]:
+                if other <= one:
                     continue
-                reach = radius * max(np.float64(values[begin + one, _SIGMA]), np.float64(values[begin + other, _SIGMA]))
+                sigma = max(values[standing[one], _SIGMA], values[standing[other], _SIGMA])
+                reach = radius * np.float64(sigma)
                 squared = (points[one, 0] - points[other, 0]) ** 2 + (points[one, 1] - points[other, 1]) ** 2
                 if squared > reach * reach:
                     continue
