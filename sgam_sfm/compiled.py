@@ -10,8 +10,13 @@ import numba
 
 Function = TypeVar("Function", bound=Callable)
 
+_SETTINGS = {"nogil": True, "error_model": "numpy"}  # the latter: x / 0 is infinite, not an error to look out for
+
 
 def compiled(function: Function) -> Function:
     """The function as machine code that lets other threads run meanwhile; arguments are arrays and numbers."""
-    # What checks the shapes of arguments in tests wraps functions, and cannot be compiled.
-    return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function)))
+    plain = inspect.unwrap(function)  # what checks the shapes of arguments in tests cannot be compiled
+    try:
+        return cast(Function, numba.njit(plain, cache=True, **_SETTINGS))
+    except RuntimeError:  # neither beside this file nor in the user's folders may anything be written
+        return cast(Function, numba.njit(plain, **_SETTINGS))

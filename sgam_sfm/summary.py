@@ -15,7 +15,7 @@ from sgam_sfm.keypoints import CollectionKeypoints
 from sgam_sfm.mapping import VerificationSummary
 from sgam_sfm.store import PairRecord
 
-_PACKAGES = ("sgam-sfm", "pycolmap", "torch", "kornia", "numpy", "opencv-python-headless", "onnxruntime")
+_PACKAGES = ("sgam-sfm", "pycolmap", "torch", "kornia", "numpy", "numba", "opencv-python-headless", "onnxruntime")
 
 
 def summarise_images(inputs: Inputs) -> dict[str, Any]:

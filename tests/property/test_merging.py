@@ -1,4 +1,5 @@
 import itertools
+from unittest import mock
 
 import numpy as np
 from hypothesis import given, settings
@@ -92,6 +93,24 @@ def test_the_order_of_pairs_changes_nothing_and_a_reversed_pair_has_reversed_mat
         np.testing.assert_array_equal(merged.scores[a, b], expected.scores[min(a, b), max(a, b)])
 
 
+@settings(max_examples=15, deadline=None)
+@given(collections(), st.integers(1, 40), st.integers(1, 40))
+def test_the_size_of_the_pieces_changes_nothing(pairs, matches_at_once, rows_a_part):
+    expected = merge_keypoints(pairs)
+    with (
+        mock.patch("sgam_sfm.merging._AT_ONCE", matches_at_once),
+        mock.patch("sgam_sfm.merging._ROWS_A_PART", rows_a_part),
+        mock.patch("sgam_sfm.scratch._BUFFERED", 8 * rows_a_part),
+        mock.patch("sgam_sfm.scratch._ROWS_AT_ONCE", rows_a_part),
+    ):
+        merged = merge_keypoints(pairs)
+    for name in expected.keypoints:
+        np.testing.assert_array_equal(merged.keypoints[name], expected.keypoints[name])
+    for pair in expected.matches:
+        np.testing.assert_array_equal(merged.matches[pair], expected.matches[pair])
+        np.testing.assert_array_equal(merged.scores[pair], expected.scores[pair])
+
+
 @settings(max_examples=30, deadline=None)
 @given(collections(), st.sampled_from([0.5, 2.0, 8.0]))
 def test_a_larger_image_with_a_larger_sigma_gives_the_same_tracks(pairs, zoom):
@@ -114,7 +133,7 @@ def test_a_larger_image_with_a_larger_sigma_gives_the_same_tracks(pairs, zoom):
 
 
 def one_after_the_other(points, images, sigmas, edges, radius):
-    """What `_Tracks.join` must come to, edge by edge: track and standing keypoint of every keypoint.
+    """What `Tracks.join` must come to, edge by edge: track and standing keypoint of every keypoint.
 
     edges: (a, b, images that both tracks must be in).
     """
