@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
 
 Function = TypeVar("Function", bound=Callable)
 
-_SETTINGS = {"nogil": True, "error_model": "numpy"}  # the latter: x / 0 is infinite, not an error to look out for
+_SETTINGS: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+}  # the latter: x / 0 is infinite, not an error to look out for
 
 
 def compiled(function: Function) -> Function:

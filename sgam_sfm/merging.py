@@ -15,7 +15,7 @@ Distances are in matcher pixels (image pixels / sigma), so that coarse and fine 
 only read: merging can be repeated with other options.
 
 Memory does not grow with the matches. They are kept in one file, a row each, which every step reads again, pair by pair
-or image by image; what must be in another order is sorted on disk. In memory are 32 bytes a keypoint and small records
+or image by image; what must be in another order is sorted on disk. In memory are 24 bytes a keypoint and small records
 of images and pairs. Results do not depend on the order of the pairs, nor on the number of threads.
 """
 
@@ -143,7 +143,8 @@ def merging(
         if options.track_radius_px > 0 and options.min_shared_images > 0:
             for edges in _side_by_side(tracks, bounds, options.min_shared_images, scratch):
                 tracks.join(edges, options.min_shared_images)
-        tracks.settle(_OCTAVE)
+        for begin, end in pairwise(bounds.tolist()):
+            tracks.settle(begin, told.read(begin, end - begin)[:, 3], _OCTAVE)
         num_conflicts = _align(raw, tracks, scratch)
         merged = _export(raw, tracks, bounds, options.max_residual_sigmas, num_conflicts, scratch)
         del tracks

@@ -15,44 +15,38 @@ from sgam_sfm.alignment import align_keypoints
 from sgam_sfm.compiled import compiled
 from sgam_sfm.grid import cells_around, grid_of
 
-# What is known of a keypoint is in one row of 32 bytes, since most of the time goes into fetching it from memory.
-_PARENT, _NEXT, _IMAGE, _STANDS = 0, 1, 2, 3  # a track's root has minus the number of its members as its parent
-_X, _Y, _SIGMA, _WEIGHT = 4, 5, 6, 7
-_COLUMNS = 8
+# What is known of a keypoint is in one row of 24 bytes, since most of the time goes into fetching it from memory. The
+# keypoints that stand for a track in their images are linked in a ring; one that does not stand any more has minus its
+# image, minus 1, and a link to what it became part of. A track's root has minus its number of members as its parent.
+_PARENT, _LINK, _IMAGE, _X, _Y, _SIGMA = range(6)
+_COLUMNS = 6
 
 
 class Tracks:
     """Tracks of keypoints, each with at most one keypoint in an image; every keypoint is one of its own to begin with.
 
-    It takes 32 bytes a keypoint and nothing for a match.
+    It takes 24 bytes a keypoint and nothing for a match.
 
-    points (K, 2), images (K,), sigmas (K,): of the keypoints. weights (K,): of their points, 1 when left out. radius:
-    matcher pixels within which two keypoints of an image may become one.
+    points (K, 2), images (K,), sigmas (K,): of the keypoints. radius: matcher pixels within which two keypoints of an
+    image may become one.
     """
 
-    def __init__(
-        self,
-        points: np.ndarray,
-        images: np.ndarray,
-        sigmas: np.ndarray,
-        radius: float,
-        weights: np.ndarray | None = None,
-    ) -> None:
+    def __init__(self, points: np.ndarray, images: np.ndarray, sigmas: np.ndarray, radius: float) -> None:
         self._begin(len(images), int(images.max(initial=-1)) + 1, radius)
-        self._fill(0, points, images, sigmas, np.ones(len(images)) if weights is None else weights)
+        self._fill(0, points, images, sigmas)
 
     @classmethod
     def of_images(cls, bounds: np.ndarray, keypoints: Callable[[int, int], np.ndarray], radius: float) -> Tracks:
         """The same for keypoints that are read image by image.
 
-        Args: bounds: (N + 1,) where those of each image begin. keypoints: place, sigma and weight (n, 4) of a number of
-            keypoints from one on.
+        Args: bounds: (N + 1,) where those of each image begin. keypoints: place and sigma (n, 3) of a number of
+            keypoints from one on; more columns are left alone.
         """
         tracks = cls.__new__(cls)
         tracks._begin(int(bounds[-1]), len(bounds) - 1, radius)
         for image, (begin, end) in enumerate(pairwise(bounds.tolist())):
             told = keypoints(begin, end - begin)
-            tracks._fill(begin, told[:, :2], np.full(end - begin, image), told[:, 2], told[:, 3])
+            tracks._fill(begin, told[:, :2], np.full(end - begin, image), told[:, 2])
         return tracks
 
     def _begin(self, count: int, num_images: int, radius: float) -> None:
@@ -61,14 +55,11 @@ class Tracks:
         self._stamps = np.full(num_images, -1, np.int32)
         self._radius = radius
 
-    def _fill(
-        self, begin: int, points: np.ndarray, images: np.ndarray, sigmas: np.ndarray, weights: np.ndarray
-    ) -> None:
+    def _fill(self, begin: int, points: np.ndarray, images: np.ndarray, sigmas: np.ndarray) -> None:
         here = slice(begin, begin + len(images))
         self._rows[here, _PARENT], self._rows[here, _IMAGE] = -1, images
-        self._rows[here, _NEXT] = self._rows[here, _STANDS] = np.arange(here.start, here.stop)
+        self._rows[here, _LINK] = np.arange(here.start, here.stop)
         self._values[here, _X : _Y + 1], self._values[here, _SIGMA] = points, sigmas
-        self._values[here, _WEIGHT] = weights
 
     def track(self, keypoints: np.ndarray | None = None) -> Int[np.ndarray, " K"]:
         """The keypoint that gives each of some keypoints' track its number; of all when left out."""
@@ -91,13 +82,13 @@ class Tracks:
         """
         _join(self._rows, self._values, self._stamps, edges, self._radius, min_shared)
 
-    def settle(self, octave: float) -> None:
-        """End joining: put every standing keypoint to the mean of those that became part of it, by weight.
+    def settle(self, begin: int, weights: np.ndarray, octave: float) -> None:
+        """End joining: put every standing keypoint of an image to the mean of those that became part of it.
 
-        octave: those whose sigma is so many times its own have no say.
+        begin: the first keypoint of the image. weights: of its keypoints. octave: those whose sigma is so many times
+        that of the standing one have no say.
         """
-        _settle(self._rows, self._values, octave)
-        self._rows[:, _NEXT] = -1
+        _settle(self._rows, self._values, begin, weights.astype(np.float64), octave)
 
     def align(
         self, index: np.ndarray, tracks: np.ndarray, offsets: np.ndarray, affine: np.ndarray, weights: np.ndarray
@@ -106,22 +97,22 @@ class Tracks:
 
         See `align_keypoints`.
         """
-        points, sigmas, slots = self._values[:, _X : _Y + 1], self._values[:, _SIGMA], self._rows[:, _NEXT]
+        points, sigmas, slots = self._values[:, _X : _Y + 1], self._values[:, _SIGMA], self._rows[:, _LINK]
         align_keypoints(points, sigmas, slots, index, tracks, offsets, affine, weights)
 
     def mark_used(self, keypoints: np.ndarray) -> None:
         """Mark keypoints as used, once all are aligned."""
-        self._rows[keypoints, _NEXT] = 0
+        self._rows[keypoints, _LINK] = 0
 
     def number_used(self, begin: int, end: int) -> Int[np.ndarray, " N"]:
         """The used ones among the keypoints of an image, which are numbered 0, 1, ... from now on."""
-        used = np.flatnonzero(self._rows[begin:end, _NEXT] >= 0) + begin
-        self._rows[used, _NEXT] = np.arange(len(used))
+        used = np.flatnonzero((self._rows[begin:end, [_LINK, _IMAGE]] >= 0).all(axis=1)) + begin
+        self._rows[used, _LINK] = np.arange(len(used))
         return used
 
     def number(self, keypoints: np.ndarray) -> Int[np.ndarray, " *_"]:
         """The numbers of used keypoints in their images."""
-        return self._rows[keypoints, _NEXT]
+        return self._rows[keypoints, _LINK]
 
     def side_by_side(self, begin: int, end: int) -> tuple[Int[np.ndarray, "T 2"], Float[np.ndarray, " T"]]:
         """Pairs of tracks, smaller number first, with keypoints of one image within the radius, and their distances.
@@ -155,13 +146,17 @@ def _roots(rows: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
 
 
 @compiled
+def _stands(rows: np.ndarray, keypoint: int) -> int:
+    while rows[keypoint, _IMAGE] < 0:
+        keypoint = rows[keypoint, _LINK]
+    return keypoint
+
+
+@compiled
 def _standing(rows: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
     found = np.empty(len(keypoints), np.int64)
     for place in range(len(keypoints)):
-        keypoint = keypoints[place]
-        while rows[keypoint, _STANDS] != keypoint:
-            keypoint = rows[keypoint, _STANDS]
-        found[place] = keypoint
+        found[place] = _stands(rows, keypoints[place])
     return found
 
 
@@ -169,23 +164,21 @@ def _standing(rows: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
 def _join(
     rows: np.ndarray, values: np.ndarray, stamps: np.ndarray, edges: np.ndarray, radius: float, min_shared: int
 ) -> None:
-    """The standing keypoints of a track are linked in a ring by `_NEXT`."""
     for edge in range(len(edges)):
         kept, gone = _root(rows, edges[edge, 0]), _root(rows, edges[edge, 1])
         if kept == gone:
             continue
         if rows[kept, _PARENT] > rows[gone, _PARENT]:
             kept, gone = gone, kept
-        # The ring of a track may begin at a keypoint that no longer stands: `_NEXT` of the root still leads into it.
-        first = rows[gone, _NEXT]
+        first = _stands(rows, gone)
         member = first
         while True:
             stamps[rows[member, _IMAGE]] = member
-            member = rows[member, _NEXT]
+            member = rows[member, _LINK]
             if member == first:
                 break
         shared, fine = 0, True
-        entry = rows[kept, _NEXT]
+        entry = _stands(rows, kept)
         member = entry
         while True:
             other = stamps[rows[member, _IMAGE]]
@@ -197,81 +190,76 @@ def _join(
                 if step_x**2 + step_y**2 > reach**2:
                     fine = False
                     break
-            member = rows[member, _NEXT]
+            member = rows[member, _LINK]
             if member == entry:
                 break
         if fine and shared >= min_shared:
-            _unite(rows, values, stamps, kept, gone, first, shared)
-        else:
-            member = first
-            while True:
-                stamps[rows[member, _IMAGE]] = -1
-                member = rows[member, _NEXT]
-                if member == first:
-                    break
-
-
-@compiled
-def _unite(
-    rows: np.ndarray, values: np.ndarray, stamps: np.ndarray, kept: int, gone: int, first: int, shared: int
-) -> None:
-    """One ring of two, with the finer of two keypoints in an image; clears the stamps."""
-    before = rows[kept, _NEXT]  # a keypoint of the ring: walk it once, dropping those that do not stand any more
-    ring_first, ring_last, count = -1, -1, 0
-    member = before
-    while True:
-        follower = rows[member, _NEXT]
-        image = rows[member, _IMAGE]
-        other = stamps[image]
-        if other >= 0 and values[other, _SIGMA] < values[member, _SIGMA]:
-            rows[member, _STANDS] = other
-        else:
-            if other >= 0:
-                rows[other, _STANDS] = member
-                stamps[image] = -1
-            if ring_first < 0:
-                ring_first = member
-            else:
-                rows[ring_last, _NEXT] = member
-            ring_last = member
-            count += 1
-        member = follower
-        if member == before:
-            break
-    member = first
-    while True:
-        follower = rows[member, _NEXT]
-        if stamps[rows[member, _IMAGE]] == member:
+            rows[kept, _PARENT] = -_one_ring(rows, values, stamps, entry, first)
+            rows[gone, _PARENT] = kept
+            continue
+        member = first
+        while True:
             stamps[rows[member, _IMAGE]] = -1
-            if ring_first < 0:
-                ring_first = member
-            else:
-                rows[ring_last, _NEXT] = member
-            ring_last = member
-            count += 1
-        member = follower
-        if member == first:
-            break
-    rows[ring_last, _NEXT] = ring_first
-    # Where the root itself no longer stands it keeps a way into the ring.
-    if rows[kept, _STANDS] != kept:
-        rows[kept, _NEXT] = ring_first
-    rows[kept, _PARENT] = -count
-    rows[gone, _PARENT] = kept
+            member = rows[member, _LINK]
+            if member == first:
+                break
 
 
 @compiled
-def _settle(rows: np.ndarray, values: np.ndarray, octave: float) -> None:
-    for keypoint in range(len(rows)):
-        stands = keypoint
-        while rows[stands, _STANDS] != stands:
-            stands = rows[stands, _STANDS]
+def _one_ring(rows: np.ndarray, values: np.ndarray, stamps: np.ndarray, entry: int, first: int) -> int:
+    """One ring of two, with the finer of two keypoints of an image.
+
+    Args: entry, first: a keypoint of either. stamps: the keypoint of the second ring in every image, -1 for none; they
+        are cleared.
+    Returns: the length of the ring.
+    """
+    head, last, count = -1, -1, 0
+    for start in (entry, first):
+        member = start
+        while True:
+            follower, image = rows[member, _LINK], rows[member, _IMAGE]
+            other, stays = stamps[image], True
+            if start == entry and other >= 0:
+                stays = values[other, _SIGMA] >= values[member, _SIGMA]
+                if stays:
+                    stamps[image] = -2 - member  # told to the other one when its turn comes
+                else:
+                    rows[member, _LINK] = other
+            elif start == first:
+                stays = other >= 0
+                if not stays:
+                    rows[member, _LINK] = -2 - other
+                stamps[image] = -1
+            if not stays:
+                rows[member, _IMAGE] = -1 - image
+            else:
+                if head < 0:
+                    head = member
+                else:
+                    rows[last, _LINK] = member
+                last = member
+                count += 1
+            member = follower
+            if member == start:
+                break
+    rows[last, _LINK] = head
+    return count
+
+
+@compiled
+def _settle(rows: np.ndarray, values: np.ndarray, begin: int, weights: np.ndarray, octave: float) -> None:
+    for place in range(len(weights)):
+        keypoint = begin + place
+        stands = _stands(rows, keypoint)
         if stands == keypoint or values[keypoint, _SIGMA] >= octave * values[stands, _SIGMA]:
             continue
-        share = values[keypoint, _WEIGHT] / (values[keypoint, _WEIGHT] + values[stands, _WEIGHT])
+        share = weights[place] / (weights[place] + weights[stands - begin])
         for axis in (_X, _Y):
             values[stands, axis] += share * (values[keypoint, axis] - values[stands, axis])
-        values[stands, _WEIGHT] += values[keypoint, _WEIGHT]
+        weights[stands - begin] += weights[place]
+    for keypoint in range(begin, begin + len(weights)):
+        if rows[keypoint, _IMAGE] >= 0:
+            rows[keypoint, _LINK] = -1
 
 
 @compiled
@@ -282,7 +270,7 @@ def _near_tracks(
     standing, roots = np.empty(end - begin, np.int64), np.empty(end - begin, np.int64)
     points = np.empty((end - begin, 2))
     for keypoint in range(begin, end):
-        if rows[keypoint, _STANDS] != keypoint:
+        if rows[keypoint, _IMAGE] < 0:
             continue
         coarsest = max(coarsest, np.float64(values[keypoint, _SIGMA]))
         points[count, 0], points[count, 1] = values[keypoint, _X], values[keypoint, _Y]
