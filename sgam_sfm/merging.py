@@ -49,7 +49,7 @@ _FOLDER = ".merging"
 _MIN_WEIGHT = 1e-3  # a match of score 0 still has a place
 _OCTAVE = 2.0  # points whose sigma is so many times the finest have no say in where a keypoint lies
 _AT_ONCE = 2**15  # matches in one go
-_ROWS_A_PART = 2**20  # rows that are sorted in memory
+_ROWS_A_PART = 2**18  # rows that are sorted in memory
 _STEPS = 16  # of strength in an octave: a stronger match joins first, those alike in the order of their pairs
 _SHARED = 1000  # no two tracks share more images, as far as their order is concerned
 
