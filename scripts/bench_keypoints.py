@@ -23,8 +23,9 @@ from scipy.spatial import cKDTree
 
 from sgam_core.types import Matches
 from sgam_sfm.database import CameraOptions, import_cameras, write_database
-from sgam_sfm.keypoints import KeypointOptions, merge_keypoints
+from sgam_sfm.keypoints import KeypointOptions
 from sgam_sfm.mapping import map_images, verify
+from sgam_sfm.merging import merge_keypoints
 from sgam_sfm.store import read_pairs_of
 
 Pair = tuple[str, str]

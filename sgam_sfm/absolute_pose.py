@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from sgam_core import Matches
-from sgam_sfm.tracks import local_affine
+from sgam_sfm.affine import local_affine
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

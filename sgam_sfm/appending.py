@@ -75,9 +75,13 @@ def append_to_database(
     """
     with changing_copy(imported, path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
-        first = {name: _append(database, ids[name], name, points) for name, points in sorted(keypoints.items())}
-        for pair, rows in sorted(matches.items()):
-            check_matches(pair, rows, (len(keypoints[pair[0]]), len(keypoints[pair[1]])))
+        first, counts = {}, {}
+        for name in sorted(keypoints):
+            points = keypoints[name]
+            first[name], counts[name] = _append(database, ids[name], name, points), len(points)
+        for pair in sorted(matches):
+            rows = matches[pair]
+            check_matches(pair, rows, (counts[pair[0]], counts[pair[1]]))
             id0, id1 = (ids[name] for name in pair)
             ours = rows.astype(np.int64) + [first[name] for name in pair]
             there = np.asarray(database.read_matches(id0, id1), np.int64).reshape(-1, 2)

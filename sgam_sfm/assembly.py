@@ -5,16 +5,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+import logging
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-
-from sgam_core import Matches
 from sgam_core.geometry import residuals
 from sgam_sfm.colmap_reading import read_camera_ids, read_counts, read_match_counts
-from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
-from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions, merge_keypoints
+from sgam_sfm.hloc_files import matches_h5_size, write_keypoints_h5, write_matches_h5
+from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions
 from sgam_sfm.mapping import (
     MappingOptions,
     MappingSummary,
@@ -23,38 +22,55 @@ from sgam_sfm.mapping import (
     map_images,
     verify,
 )
-from sgam_sfm.pairs import Pair
+from sgam_sfm.merging import RawPair, merging
 from sgam_sfm.progress import Advance, Stages
 from sgam_sfm.store import PairRecord
 
+_log = logging.getLogger(__name__)
 
-def merge_records(
+_LARGEST_MATCHES_H5 = 2**31  # bytes
+
+
+@contextmanager
+def merged_records(
     records: Iterable[PairRecord], options: KeypointOptions, max_residual: float, output: Path
-) -> CollectionKeypoints:
-    """Keypoints from the raw matches of all pairs, in OUT/keypoints.h5 and OUT/matches.h5 too.
+) -> Iterator[CollectionKeypoints]:
+    """Keypoints from the raw matches of all pairs; their arrays can be read inside the context.
 
-    Args: max_residual: of an inlier of its pair's geometry, see `GeometryOptions`.
+    Args: max_residual: of an inlier of its pair's geometry, see `GeometryOptions`. output: is given a folder for the
+        arrays, which is removed at the end.
     """
-    matches, inliers = stored_matches(records, max_residual)
-    merged = merge_keypoints(matches, options, inliers)
+    raw = (_raw_pair(record, max_residual) for record in records if record.result and len(record.result.matches))
+    with merging(raw, output, options) as merged:
+        yield merged
+
+
+def _raw_pair(record: PairRecord, max_residual: float) -> RawPair:
+    """The matches of a pair, and which of them agree with its geometry."""
+    assert record.result is not None
+    matches, model = record.result.matches, record.result.two_view
+    return record.pair, matches, None if model is None else residuals(model.F, matches) <= max_residual
+
+
+def write_for_hloc(merged: CollectionKeypoints, output: Path, *, large: bool = False) -> None:
+    """OUT/keypoints.h5 and OUT/matches.h5.
+
+    The latter has a group for every pair and a number for every keypoint of its first image, matched or not. When that
+    is many times the database, it is left out unless `large`, and an older one is removed, since it would be taken for
+    it.
+    """
     write_keypoints_h5(output / "keypoints.h5", merged.keypoints)
     counts = {name: len(points) for name, points in merged.keypoints.items()}
-    write_matches_h5(output / "matches.h5", merged.matches, merged.scores, counts)
-    return merged
-
-
-def stored_matches(
-    records: Iterable[PairRecord], max_residual: float
-) -> tuple[dict[Pair, Matches], dict[Pair, np.ndarray]]:
-    """The point matches of every pair that has any, and (M,) which of them agree with the pair's geometry."""
-    matches, inliers = {}, {}
-    for record in records:
-        if record.result is not None and len(record.result.matches):
-            matches[record.pair] = record.result.matches
-            model = record.result.two_view
-            if model is not None:
-                inliers[record.pair] = residuals(model.F, record.result.matches) <= max_residual
-    return matches, inliers
+    size, path = matches_h5_size(merged.matches, counts), output / "matches.h5"
+    if size > _LARGEST_MATCHES_H5 and not large:
+        _log.warning(
+            "%s is left out: in hloc's layout the matches of %d pairs take about %.1f GB; if you need it, "
+            "`sgam-sfm aggregate '%s' --hloc` writes it (the database is whole)",
+            *(path.name, len(merged.matches), size / 1e9, output),
+        )
+        path.unlink(missing_ok=True)
+        return
+    write_matches_h5(path, merged.matches, merged.scores, counts)
 
 
 def verify_pairs(

@@ -234,6 +234,8 @@ def write_database(
 ) -> None:
     """Write a database that is ready to be verified and mapped; it appears at `path` only when it is complete.
 
+    Arrays are asked for one at a time.
+
     Args: imported: database of `import_cameras`, whose images and cameras are copied (it may be `path` itself).
         keypoints: (N, 2) pixels by image name, corner origin; an image left out gets none. matches: (M, 2) indices of
         keypoints by pair, one-to-one.
@@ -249,15 +251,19 @@ def write_database(
         unknown = ({*keypoints} | {name for pair in matches for name in pair}) - {*ids}
         if unknown:
             raise InputError(f"image '{min(unknown)}' is not in {imported}; import its camera first")
-        for name, image_id in sorted(ids.items(), key=lambda item: item[1]):
-            points = keypoints.get(name, np.zeros((0, 2), np.float32))
-            check_keypoints(name, points)
-            database.write_keypoints(image_id, np.ascontiguousarray(points, np.float32))
-        for pair, indices in sorted(matches.items(), key=lambda item: sorted(ids[name] for name in item[0])):
-            check_matches(pair, indices, (len(keypoints.get(pair[0], ())), len(keypoints.get(pair[1], ()))))
-            if database.exists_matches(ids[pair[0]], ids[pair[1]]):
-                raise InputError(f"the pair {pair} has matches in both directions; give them in one")
-            database.write_matches(ids[pair[0]], ids[pair[1]], np.ascontiguousarray(indices, np.uint32))
+        counts = dict.fromkeys(ids, 0)
+        with pycolmap.DatabaseTransaction(database):
+            for name, image_id in sorted(ids.items(), key=lambda item: item[1]):
+                points = keypoints.get(name, np.zeros((0, 2), np.float32))
+                check_keypoints(name, points)
+                counts[name] = len(points)
+                database.write_keypoints(image_id, np.ascontiguousarray(points, np.float32))
+            for pair in sorted(matches, key=lambda pair: sorted(ids[name] for name in pair)):
+                if pair[::-1] in matches:
+                    raise InputError(f"the pair {pair} has matches in both directions; give them in one")
+                indices = matches[pair]
+                check_matches(pair, indices, (counts[pair[0]], counts[pair[1]]))
+                database.write_matches(ids[pair[0]], ids[pair[1]], np.ascontiguousarray(indices, np.uint32))
 
 
 @contextmanager
@@ -454,7 +460,7 @@ def check_matches(pair: Pair, indices: np.ndarray, counts: tuple[int, int]) -> N
                 f"matches of {pair} name keypoint {column.max() if column.min() >= 0 else column.min()} of "
                 f"'{pair[side]}', which has {counts[side]}"
             )
-        if len(np.unique(column)) != len(column):
+        if len(column) and np.bincount(column).max() > 1:
             raise ShapeError(f"matches of {pair} use a keypoint of '{pair[side]}' more than once; expected one-to-one")
 
 

@@ -21,6 +21,7 @@ from sgam_sfm.pairs import Pair
 
 _log = logging.getLogger(__name__)
 
+_GROUP_BYTES = 1500  # a pair, before its arrays
 _H5_OVERHEAD = 8192  # bytes a group, generously: on a full disk HDF5 ends the process instead of raising an error
 
 
@@ -32,10 +33,16 @@ def write_keypoints_h5(path: Path, keypoints: Mapping[str, np.ndarray]) -> None:
     """
     require_space(path, sum(_H5_OVERHEAD + 8 * len(points) for points in keypoints.values()))
     with replacing(path) as partial, h5py.File(partial, "w") as file:
-        for name, points in sorted(keypoints.items()):
+        for name in sorted(keypoints):
+            points = keypoints[name]
             if points.ndim != 2 or points.shape[1] != 2:
                 raise ShapeError(f"keypoints of '{name}' have shape {points.shape}; expected (N, 2)")
             file[f"{name}/keypoints"] = (np.asarray(points, np.float64) - 0.5).astype(np.float32)
+
+
+def matches_h5_size(pairs: Iterable[Pair], keypoint_counts: Mapping[str, int]) -> int:
+    """About how many bytes a matches file takes."""
+    return sum(_GROUP_BYTES + 6 * keypoint_counts[pair[0]] for pair in pairs)
 
 
 def write_matches_h5(
@@ -64,7 +71,8 @@ def write_matches_h5(
         return
     require_space(path, sum(_H5_OVERHEAD + 6 * keypoint_counts[pair[0]] for pair in matches))
     with replacing(path) as partial, h5py.File(partial, "w") as file:
-        for pair, indices in sorted(matches.items()):
+        for pair in sorted(matches):
+            indices = matches[pair]
             counts = (keypoint_counts[pair[0]], keypoint_counts[pair[1]])
             if len(indices) != len(scores[pair]):
                 raise ShapeError(f"pair {pair} has {len(indices)} matches but {len(scores[pair])} scores")

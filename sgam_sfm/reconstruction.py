@@ -9,7 +9,7 @@ from typing import Any
 
 from sgam_core.errors import InputError, OptionError
 from sgam_sfm.appending import stamp_of
-from sgam_sfm.assembly import build_models, merge_records, verify_pairs
+from sgam_sfm.assembly import build_models, merged_records, verify_pairs, write_for_hloc
 from sgam_sfm.colmap_reading import read_camera_ids
 from sgam_sfm.database import copy_database, write_database
 from sgam_sfm.files import write_json
@@ -55,9 +55,11 @@ def aggregate(options: AggregateOptions, stages: Stages | None = None) -> dict[s
         use_threads(options.threads)
         run = starting_options(folder / "options.json", None)
         with stages.stage("Merging keypoints", None):
-            found = merge_records(read_pairs_of(folder), options.keypoints, run.geometry.max_residual, source.output)
-            write_database(source.written, folder / "cameras.db", found.keypoints, found.matches)
-        content = {"keypoints": summarise_keypoints(found)}
+            records, limit = read_pairs_of(folder), run.geometry.max_residual
+            with merged_records(records, options.keypoints, limit, source.output) as merged:
+                write_database(source.written, folder / "cameras.db", merged.keypoints, merged.matches)
+                write_for_hloc(merged, source.output, large=options.hloc)
+                content: dict[str, Any] = {"keypoints": summarise_keypoints(merged)}
         content |= _verify_and_map(options, source, stages, anew=True, mapping=options.mapping)
         source.keep({"keypoints": asdict(options.keypoints)}, content)
         written: dict[str, Any] = write_json(source.output / "aggregate.json", content)

@@ -11,7 +11,7 @@ from typing import Any
 from sgam_core import PointMatcher
 from sgam_core.errors import OptionError
 from sgam_sfm.appending import Stamp, append_to_database, replace_database, stamp_of
-from sgam_sfm.assembly import build_models, merge_records, verify_pairs
+from sgam_sfm.assembly import build_models, merged_records, verify_pairs, write_for_hloc
 from sgam_sfm.database import is_whole, write_database
 from sgam_sfm.executors import MatchingJob, open_executor
 from sgam_sfm.files import write_json
@@ -28,7 +28,7 @@ from sgam_sfm.results import json_object
 from sgam_sfm.run_record import recording
 from sgam_sfm.shards import Shard
 from sgam_sfm.store import PairStore
-from sgam_sfm.summary import summarise_images, summarise_keypoints, summarise_pairs, versions
+from sgam_sfm.summary import CountedPairs, summarise_images, summarise_keypoints, summarise_pairs, versions
 
 _log = logging.getLogger(__name__)
 _WITHOUT_EFFECT = frozenset({"output", "config", "threads", "verbose", "log_json", "accept_licence"})
@@ -88,11 +88,13 @@ def _summarise_shard(
 ) -> dict[str, Any]:
     """What is known of a run that stops before merging, as OUT/summary.json."""
     nothing = VerificationSummary(inliers={}, num_pairs=0, seconds=0.0, peak_memory_mb=None)
-    records = (record for number in share for record in store.read(number))
+    counted = CountedPairs(record for number in share for record in store.read(number))
+    for _ in counted:
+        pass
     summary = {
         "shard": {"shard": job.options.shard, "blocks": len(share)},
         "images": summarise_images(job.inputs),
-        "pairs": summarise_pairs(job.inputs, records, nothing),
+        "pairs": summarise_pairs(job.inputs, counted, nothing),
         "labels": _summarise_labels(job),
         "models": [],
         "no_model": f"shard {job.options.shard} has its own pairs only; `sgam-sfm join` puts all shards together",
@@ -116,17 +118,19 @@ def assemble(
     """
     options, inputs, output = job.options, job.inputs, job.options.output
     with stages.stage("Merging keypoints", None):
-        records = list(store.read_all(num_blocks))
-        merged = merge_records(records, options.keypoints, options.geometry.max_residual, output)
-        write = write_database if existing is None else append_to_database
-        write(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
+        counted = CountedPairs(store.read_all(num_blocks))
+        with merged_records(counted, options.keypoints, options.geometry.max_residual, output) as merged:
+            write = write_database if existing is None else append_to_database
+            write(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
+            write_for_hloc(merged, output)
+            keypoints = summarise_keypoints(merged)
     verified, mapped = reconstruct(options, inputs, stages, existing)
 
     summary = {
         "images": summarise_images(inputs),
-        "pairs": summarise_pairs(inputs, records, verified),
+        "pairs": summarise_pairs(inputs, counted, verified),
         "labels": _summarise_labels(job),
-        "keypoints": summarise_keypoints(merged),
+        "keypoints": keypoints,
         "models": [] if mapped is None else mapped.models,
         "no_model": "mapping was not asked for (--no-mapping)" if mapped is None else mapped.reason,
         "seconds": stages.seconds,

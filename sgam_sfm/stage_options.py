@@ -77,6 +77,8 @@ class AggregateOptions(_ModelOptions):
     """Make a model; --no-mapping stops after the geometric verification."""
     keypoints: KeypointOptions = field(default_factory=KeypointOptions)
     """Merging the points of all pairs into keypoints."""
+    hloc: bool = False
+    """Write matches.h5 even when it takes more than 2 GB, which hloc's layout does for tens of thousands of pairs."""
 
 
 @dataclass(frozen=True, kw_only=True)

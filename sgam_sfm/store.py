@@ -1,14 +1,15 @@
 """Raw pair results on disk, one HDF5 file per block of pairs: the unit of work and of resume.
 
 A block's file appears under its name only when it is whole, so that a block either counts as done or is done again. It
-begins with a digest of what follows, so that a block that the disk has damaged is found, and done again too.
+begins with a digest of what follows, so that a block that the disk has damaged is found, and done again too. The
+matches of its pairs follow each other in one array per field: HDF5 needs about as long for an array of one pair as for
+one of thousands of matches.
 
     pairs/00000.h5          user block: SHA-256 of the rest; attributes: fingerprint
-      /0, /1, ...           one group a pair, in the block's order
-         attributes         name0, name1, error and fallback (empty: none)
-         facts              areas, two-view geometry, ... as JSON
-         points0, points1   (M, 2) float32 pixels, corner origin
-         scores, sigmas0, sigmas1, area_index  (M,)
+      facts                 JSON: for every pair its names, error, fallback, areas, two-view geometry, ...
+      ends                  (P,) the row after the last match of every pair
+      points0, points1      (M, 2) float32 pixels, corner origin
+      scores, sigmas0, sigmas1, area_index  (M,)
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from sgam_sfm.pairs import Pair
 _ARRAYS = tuple(array.name for array in fields(Matches))
 _AREAS = TypeAdapter(tuple[AreaMatch, ...])
 _DIGEST_BLOCK = 512  # bytes before the HDF5 file proper: the smallest user block there is
-_MAX_MATCHES = 10**7  # of a pair: a file made by hand can claim any number in a few bytes
+_MAX_MATCHES = 10**8  # of a block: a file made by hand can claim any number in a few bytes
 # What h5py, json and pydantic are known to raise on files that are damaged or made by hand.
 _UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, IndexError, SGAMError)
 _log = logging.getLogger(__name__)
@@ -75,7 +76,7 @@ class PairStore:
             _check_digest(path)
             with h5py.File(path, "r") as file:
                 mark = str(file.attrs["fingerprint"])
-                names = [_names(file[str(index)]) for index in range(len(file))] if pairs else []
+                names = [_pair_of(told) for told in _read_facts(file)] if pairs else []
         except _UNREADABLE as error:
             _log.warning("'%s' is damaged (%s): its pairs are matched again, all others are kept", path, _line(error))
             return False
@@ -88,8 +89,7 @@ class PairStore:
         content = io.BytesIO()  # HDF5 ends the process when it closes a file that the disk has no room for
         with h5py.File(content, "w", track_order=True, userblock_size=_DIGEST_BLOCK) as file:
             file.attrs["fingerprint"] = self.fingerprint
-            for index, record in enumerate(records):
-                _write_record(file.create_group(str(index)), record)
+            _write_records(file, records)
         view = content.getbuffer()
         digest = hashlib.sha256(view[_DIGEST_BLOCK:]).hexdigest().encode()
         view[: len(digest)] = digest
@@ -105,9 +105,7 @@ class PairStore:
         with _readable(path):
             _check_digest(path)  # first: on damaged files HDF5's own code can fail in ways that end the process
         with _readable(path), h5py.File(path, "r") as file:
-            for index in range(len(file)):
-                record = _read_record(file[str(index)])
-                yield record
+            yield from _read_records(file)
 
     def read_all(self, blocks: int) -> Iterator[PairRecord]:
         """The records of blocks 0, 1, ... in order, one block in memory at a time."""
@@ -115,25 +113,28 @@ class PairStore:
             yield from self.read(block)
 
 
-def _write_record(group: h5py.Group, record: PairRecord) -> None:
-    group.attrs["name0"], group.attrs["name1"] = record.pair
-    group.attrs["error"] = record.error
-    result = record.result
-    if result is None:
-        return
-    group.attrs["fallback"] = result.fallback
-    group.create_dataset("facts", data=json.dumps(_facts(result)))
+def _write_records(file: h5py.File, records: Sequence[PairRecord]) -> None:
+    told = [
+        {"pair": record.pair, "error": record.error} | ({} if record.result is None else _facts(record.result))
+        for record in records
+    ]
+    parts = [Matches.empty() if record.result is None else record.result.matches for record in records]
+    file.create_dataset("facts", data=np.frombuffer(json.dumps(told).encode(), np.uint8))
+    file.create_dataset("ends", data=np.cumsum([len(part) for part in parts], dtype=np.int64))
+    joined = Matches.concatenate(parts)
     for name in _ARRAYS:
-        array = getattr(result.matches, name)
+        array = getattr(joined, name)
         array = array.astype(np.float32) if array.dtype == np.float64 else array
-        group.create_dataset(name, data=array, compression="lzf" if len(array) else None)
+        # Points are as good as random: packing them costs time and saves nothing.
+        pack = bool(len(array)) and not name.startswith("points")
+        file.create_dataset(name, data=array, compression="lzf" if pack else None)
 
 
 def _facts(result: PairResult) -> dict[str, Any]:
-    """A result but for its matches, fallback and times (times differ between runs, a block's content does not)."""
+    """A result but for its matches and times (times differ between runs, a block's content does not)."""
     facts = {
         name: getattr(result, name)
-        for name in ("coverage0", "coverage1", "whole_scale0", "whole_scale1", "notes", "pixels_matched")
+        for name in ("fallback", "coverage0", "coverage1", "whole_scale0", "whole_scale1", "notes", "pixels_matched")
     }
     model = result.two_view
     two_view = None if model is None else {name: getattr(model, name) for name in TwoViewModel.__slots__}
@@ -143,22 +144,39 @@ def _facts(result: PairResult) -> dict[str, Any]:
     return to_jsonable_python(facts)
 
 
-def _read_record(group: h5py.Group) -> PairRecord:
-    pair = _names(group)
-    error = str(group.attrs["error"])
+def _read_records(file: h5py.File) -> Iterator[PairRecord]:
+    arrays = {name: _array(file[name]) for name in _ARRAYS}
+    begin = 0
+    for told, end in zip(_read_facts(file), _array(file["ends"]).tolist(), strict=True):
+        yield _record(told, {name: array[begin:end] for name, array in arrays.items()})
+        begin = end
+
+
+def _read_facts(file: h5py.File) -> list[dict[str, Any]]:
+    """What a block tells of its pairs but for their matches."""
+    facts: list[dict[str, Any]] = json.loads(_array(file["facts"]).tobytes())
+    return facts
+
+
+def _pair_of(told: dict[str, Any]) -> Pair:
+    name0, name1 = map(str, told["pair"])
+    return name0, name1
+
+
+def _record(told: dict[str, Any], arrays: dict[str, np.ndarray]) -> PairRecord:
+    pair, error = _pair_of(told), str(told["error"])
     if error:
         return PairRecord(pair=pair, result=None, error=error)
-    facts = json.loads(group["facts"][()])
+    facts = {name: value for name, value in told.items() if name not in ("pair", "error")}
     two_view = facts.pop("two_view")
     if two_view is not None:
         two_view = TwoViewModel(**(two_view | {"F": np.array(two_view["F"])}))
     return PairRecord(
         pair=pair,
         result=PairResult(
-            matches=Matches(**{name: _array(group[name]) for name in _ARRAYS}),
+            matches=Matches(**arrays),
             areas=_AREAS.validate_python(facts.pop("areas")),
             two_view=two_view,
-            fallback=str(group.attrs["fallback"]),
             **(facts | {"notes": tuple(facts["notes"])}),
         ),
     )
@@ -201,17 +219,16 @@ def read_outcomes(path: Path) -> list[PairOutcome]:
 
     Raises: InputError for a file that is none of a store.
     """
-    outcomes = []
     with _readable(path), h5py.File(path, "r") as file:
-        for group in file.values():
-            error = str(group.attrs["error"])
-            fallback = "" if error else str(group.attrs["fallback"])
-            outcomes.append(PairOutcome(pair=_names(group), block=int(path.stem), error=error, fallback=fallback))
-    return outcomes
-
-
-def _names(group: h5py.Group) -> Pair:
-    return str(group.attrs["name0"]), str(group.attrs["name1"])
+        return [
+            PairOutcome(
+                pair=_pair_of(told),
+                block=int(path.stem),
+                error=str(told["error"]),
+                fallback=str(told.get("fallback", "")),
+            )
+            for told in _read_facts(file)
+        ]
 
 
 def _check_digest(path: Path) -> None:

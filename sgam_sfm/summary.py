@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import distributions, version
 from typing import Any
 
@@ -15,7 +15,7 @@ from sgam_sfm.keypoints import CollectionKeypoints
 from sgam_sfm.mapping import VerificationSummary
 from sgam_sfm.store import PairRecord
 
-_PACKAGES = ("sgam-sfm", "pycolmap", "torch", "kornia", "numpy", "opencv-python-headless", "onnxruntime")
+_PACKAGES = ("sgam-sfm", "pycolmap", "torch", "kornia", "numpy", "numba", "opencv-python-headless", "onnxruntime")
 
 
 def summarise_images(inputs: Inputs) -> dict[str, Any]:
@@ -28,46 +28,65 @@ def summarise_images(inputs: Inputs) -> dict[str, Any]:
     }
 
 
-def summarise_pairs(inputs: Inputs, records: Iterable[PairRecord], verified: VerificationSummary) -> dict[str, Any]:
-    """The pair list, and the areas, matches and fallbacks of all pairs."""
-    areas: Counter[str] = Counter()
-    fallbacks: Counter[str] = Counter()
-    totals: Counter[str] = Counter()
-    failed: dict[str, str] = {}
-    coverage = scale = 0.0
-    for record in records:
+class CountedPairs:
+    """Records that are counted while they pass: areas, matches and fallbacks of all pairs."""
+
+    def __init__(self, records: Iterable[PairRecord]) -> None:
+        self._records = records
+        self._areas: Counter[str] = Counter()
+        self._fallbacks: Counter[str] = Counter()
+        self._totals: Counter[str] = Counter()
+        self._failed: dict[str, str] = {}
+        self._coverage = self._scale = 0.0
+
+    def __iter__(self) -> Iterator[PairRecord]:
+        for record in self._records:
+            self._count(record)
+            yield record
+
+    def _count(self, record: PairRecord) -> None:
         result = record.result
         if result is None:
-            failed[" - ".join(record.pair)] = record.error
-            continue
-        totals["pairs"] += 1
-        totals["raw_matches"] += len(result.matches)
-        totals["pixels_matched"] += result.pixels_matched
-        totals["pairs_with_limits"] += bool(result.notes)
-        coverage += (result.coverage0 + result.coverage1) / 2
+            self._failed[" - ".join(record.pair)] = record.error
+            return
+        self._totals["pairs"] += 1
+        self._totals["raw_matches"] += len(result.matches)
+        self._totals["pixels_matched"] += result.pixels_matched
+        self._totals["pairs_with_limits"] += bool(result.notes)
+        self._coverage += (result.coverage0 + result.coverage1) / 2
         if result.fallback:
-            fallbacks[result.fallback.partition(":")[0]] += 1
+            self._fallbacks[result.fallback.partition(":")[0]] += 1
         for area in result.areas:
-            areas[f"{area.area0.kind}_{area.state}"] += 1
-            areas["predicted"] += area.predicted and area.state == "kept"
+            self._areas[f"{area.area0.kind}_{area.state}"] += 1
+            self._areas["predicted"] += area.predicted and area.state == "kept"
             if area.state == "kept":
-                totals["areas_kept"] += 1
-                scale += (area.scale0 / result.whole_scale0 + area.scale1 / result.whole_scale1) / 2
+                self._totals["areas_kept"] += 1
+                self._scale += (area.scale0 / result.whole_scale0 + area.scale1 / result.whole_scale1) / 2
+
+    def figures(self) -> dict[str, Any]:
+        """Of the records that have passed."""
+        return {
+            "matched": self._totals["pairs"],
+            "failed": self._failed,
+            "fallbacks": dict(sorted(self._fallbacks.items())),
+            "areas": dict(sorted(self._areas.items())),
+            "mean_coverage": self._coverage / max(self._totals["pairs"], 1),
+            "mean_resolution_gain": self._scale / max(self._totals["areas_kept"], 1),
+            "pairs_with_limits": self._totals["pairs_with_limits"],
+            "raw_matches": self._totals["raw_matches"],
+            "pixels_matched": self._totals["pixels_matched"],
+        }
+
+
+def summarise_pairs(inputs: Inputs, counted: CountedPairs, verified: VerificationSummary) -> dict[str, Any]:
+    """The pair list, and what became of its pairs."""
     return {
         "listed": len(inputs.pairs.pairs),
         "of_unusable_images": len(inputs.pairs.unreadable),
         "repeated": inputs.pairs.num_repeated,
         "reversed": inputs.pairs.num_reversed,
         "self": inputs.pairs.num_self,
-        "matched": totals["pairs"],
-        "failed": failed,
-        "fallbacks": dict(sorted(fallbacks.items())),
-        "areas": dict(sorted(areas.items())),
-        "mean_coverage": coverage / max(totals["pairs"], 1),
-        "mean_resolution_gain": scale / max(totals["areas_kept"], 1),
-        "pairs_with_limits": totals["pairs_with_limits"],
-        "raw_matches": totals["raw_matches"],
-        "pixels_matched": totals["pixels_matched"],
+        **counted.figures(),
         "verified": len(verified.inliers),
         "inliers": sum(verified.inliers.values()),
     }
@@ -78,7 +97,7 @@ def summarise_keypoints(merged: CollectionKeypoints) -> dict[str, Any]:
     return {
         "images": len(merged.keypoints),
         "keypoints": sum(map(len, merged.keypoints.values())),
-        "matches": sum(map(len, merged.matches.values())),
+        "matches": merged.num_matches,
         "raw_matches": merged.num_raw,
         "duplicates": merged.num_duplicates,
         "conflicts": merged.num_conflicts,

@@ -1,235 +1,305 @@
-"""Matches between numbered keypoints -> tracks of at most one keypoint per image, and keypoints moved to agree.
+"""Matches between numbered keypoints -> tracks of at most one keypoint per image.
 
-Arrays only: keypoints of the whole collection are numbered 0..K-1, `images` (K,) says which image each lies in.
+Keypoints of the whole collection are numbered 0..K-1, image by image.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_matrix, diags
-from scipy.sparse.linalg import cg
-from scipy.spatial import cKDTree
+from collections.abc import Callable
+from itertools import pairwise
 
-_PRIOR_WEIGHT = 0.005  # pull of a keypoint to its own points, against 0.5 for a sure match; a track could drift else
-_NEIGHBOURS = 12  # matches that a local affine map is fitted to
-_EDGES_AT_ONCE = 2**14  # more take more rounds, fewer take more passes over the keypoints
-_AFFINE_ROUNDS = 4  # reweighted least squares settles in three to four
+import numpy as np
+from jaxtyping import Float, Int
+
+from sgam_sfm.alignment import align_keypoints
+from sgam_sfm.compiled import compiled
+from sgam_sfm.grid import cells_around, grid_of
+
+# What is known of a keypoint is in one row of 24 bytes, since most of the time goes into fetching it from memory. The
+# keypoints that stand for a track in their images are linked in a ring; one that does not stand any more has minus its
+# image, minus 1, and a link to what it became part of. A track's root has minus its number of members as its parent.
+_PARENT, _LINK, _IMAGE, _X, _Y, _SIGMA = range(6)
+_COLUMNS = 6
 
 
 class Tracks:
     """Tracks of keypoints, each with at most one keypoint in an image; every keypoint is one of its own to begin with.
+
+    It takes 24 bytes a keypoint and nothing for a match.
 
     points (K, 2), images (K,), sigmas (K,): of the keypoints. radius: matcher pixels within which two keypoints of an
     image may become one.
     """
 
     def __init__(self, points: np.ndarray, images: np.ndarray, sigmas: np.ndarray, radius: float) -> None:
-        self._points, self._images, self._sigmas, self._radius = points, images, sigmas, radius
-        self._parent = np.arange(len(images))
-        self._replaced_by = np.arange(len(images))
+        self._begin(len(images), int(images.max(initial=-1)) + 1, radius)
+        self._fill(0, points, images, sigmas)
 
-    def track(self) -> Int[np.ndarray, " K"]:
-        """The keypoint that gives every keypoint's track its number."""
-        return _follow(self._parent)
+    @classmethod
+    def of_images(cls, bounds: np.ndarray, keypoints: Callable[[int, int], np.ndarray], radius: float) -> Tracks:
+        """The same for keypoints that are read image by image.
 
-    def representative(self) -> Int[np.ndarray, " K"]:
+        Args: bounds: (N + 1,) where those of each image begin. keypoints: place and sigma (n, 3) of a number of
+            keypoints from one on; more columns are left alone.
+        """
+        tracks = cls.__new__(cls)
+        tracks._begin(int(bounds[-1]), len(bounds) - 1, radius)
+        for image, (begin, end) in enumerate(pairwise(bounds.tolist())):
+            told = keypoints(begin, end - begin)
+            tracks._fill(begin, told[:, :2], np.full(end - begin, image), told[:, 2])
+        return tracks
+
+    def _begin(self, count: int, num_images: int, radius: float) -> None:
+        self._rows = np.empty((count, _COLUMNS), np.int32)
+        self._values = self._rows.view(np.float32)
+        self._stamps = np.full(num_images, -1, np.int32)
+        self._radius = radius
+
+    def _fill(self, begin: int, points: np.ndarray, images: np.ndarray, sigmas: np.ndarray) -> None:
+        here = slice(begin, begin + len(images))
+        self._rows[here, _PARENT], self._rows[here, _IMAGE] = -1, images
+        self._rows[here, _LINK] = np.arange(here.start, here.stop)
+        self._values[here, _X : _Y + 1], self._values[here, _SIGMA] = points, sigmas
+
+    def track(self, keypoints: np.ndarray | None = None) -> Int[np.ndarray, " K"]:
+        """The keypoint that gives each of some keypoints' track its number; of all when left out."""
+        return _roots(self._rows, np.arange(len(self._rows)) if keypoints is None else keypoints)
+
+    def representative(self, keypoints: np.ndarray | None = None) -> Int[np.ndarray, " K"]:
         """The keypoint of the same image and track that each has become part of, itself for most."""
-        return _follow(self._replaced_by)
+        return _standing(self._rows, np.arange(len(self._rows)) if keypoints is None else keypoints)
+
+    def points(self, keypoints: np.ndarray | slice) -> Float[np.ndarray, "K 2"]:
+        """Where keypoints lie."""
+        return self._values[keypoints, _X : _Y + 1].astype(np.float64)
 
     def join(self, edges: Int[np.ndarray, "E 2"], min_shared: int = 0) -> None:
         """Make one track of those of each edge's keypoints, unless that needs one keypoint at two distant spots.
 
-        The outcome is that of taking the edges one after the other. Both tracks of an edge are as they will be then as
-        soon as no edge before it touches them, so all such edges are taken at once, round after round.
+        The edges are taken one after the other.
 
         min_shared: number of images that both tracks of an edge must be in.
         """
-        for begin in range(0, len(edges), _EDGES_AT_ONCE):
-            self._join_some(edges[begin : begin + _EDGES_AT_ONCE], min_shared)
+        _join(self._rows, self._values, self._stamps, edges, self._radius, min_shared)
 
-    def _join_some(self, edges: np.ndarray, min_shared: int) -> None:
-        self._parent = _follow(self._parent)
-        roots, ends = np.unique(self._parent[edges], return_inverse=True)
-        ends = ends.reshape(-1, 2)  # tracks are numbered by the row of their root from here on
-        number = np.full(len(self._parent), -1)
-        number[roots] = np.arange(len(roots))
-        number = number[self._parent]
-        members = np.flatnonzero((number >= 0) & (self._replaced_by == np.arange(len(number))))
-        track = number[members]
-        parent, first = np.arange(len(roots)), np.empty(len(roots), np.int64)
-        while len(ends := ends[ends[:, 0] != ends[:, 1]]):
-            place = np.arange(len(ends))
-            first[ends[::-1].ravel()] = np.repeat(
-                place[::-1], 2
-            )  # of several the last assignment stays: the first edge
-            now = (first[ends] == place[:, None]).all(axis=1)
-            kept, gone = self._join_apart(ends[now], members, track, len(roots), min_shared)
-            parent[gone] = kept
-            standing = self._replaced_by[members] == members
-            members, track = members[standing], parent[track[standing]]
-            ends = parent[ends[~now]]
-        self._parent[roots] = roots[_follow(parent)]
+    def settle(self, begin: int, weights: np.ndarray, octave: float) -> None:
+        """End joining: put every standing keypoint of an image to the mean of those that became part of it.
 
-    def _join_apart(
-        self, edges: np.ndarray, members: np.ndarray, track: np.ndarray, num_tracks: int, min_shared: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Join tracks along edges (E, 2) that have no track in common, where they may be.
-
-        Args: members, track: keypoints that stand for their track in an image, and that track.
-        Returns: the tracks that were joined: those that stay, the larger ones, and those that became part of them.
+        begin: the first keypoint of the image. weights: of its keypoints. octave: those whose sigma is so many times
+        that of the standing one have no say.
         """
-        edge_of = np.full(num_tracks, -1)
-        edge_of[edges] = np.arange(len(edges))[:, None]
-        own = np.flatnonzero(edge_of[track] >= 0)
-        own = own[np.lexsort((self._images[members[own]], edge_of[track[own]]))]
-        edge = edge_of[track[own]]
-        own, at = members[own], track[own]
-        size = np.bincount(at, minlength=num_tracks)[edges]
-        kept, gone = np.where(size[:, :1] >= size[:, 1:], edges, edges[:, ::-1]).T
-        twice = np.flatnonzero((np.diff(edge) == 0) & (np.diff(self._images[own]) == 0))
-        one, other, shared = own[twice], own[twice + 1], edge[twice]
-        reach = self._radius * np.maximum(self._sigmas[one], self._sigmas[other])
-        near = np.linalg.norm(self._points[one] - self._points[other], axis=1) <= reach
-        count = np.bincount(shared, minlength=len(edges))
-        fine = (count >= min_shared) & (np.bincount(shared, near, len(edges)) == count)
-        one, other = np.where(at[twice] == kept[shared], (one, other), (other, one))[:, fine[shared]]
-        stays, goes = np.where(self._sigmas[other] < self._sigmas[one], (other, one), (one, other))
-        self._replaced_by[goes] = stays
-        return kept[fine], gone[fine]
+        _settle(self._rows, self._values, begin, weights.astype(np.float64), octave)
+
+    def align(
+        self, index: np.ndarray, tracks: np.ndarray, offsets: np.ndarray, affine: np.ndarray, weights: np.ndarray
+    ) -> None:
+        """Move the keypoints of whole tracks to where their matches agree, once they are settled.
+
+        See `align_keypoints`.
+        """
+        points, sigmas, slots = self._values[:, _X : _Y + 1], self._values[:, _SIGMA], self._rows[:, _LINK]
+        align_keypoints(points, sigmas, slots, index, tracks, offsets, affine, weights)
+
+    def mark_used(self, keypoints: np.ndarray) -> None:
+        """Mark keypoints as used, once all are aligned."""
+        self._rows[keypoints, _LINK] = 0
+
+    def number_used(self, begin: int, end: int) -> Int[np.ndarray, " N"]:
+        """The used ones among the keypoints of an image, which are numbered 0, 1, ... from now on."""
+        used = np.flatnonzero((self._rows[begin:end, [_LINK, _IMAGE]] >= 0).all(axis=1)) + begin
+        self._rows[used, _LINK] = np.arange(len(used))
+        return used
+
+    def number(self, keypoints: np.ndarray) -> Int[np.ndarray, " *_"]:
+        """The numbers of used keypoints in their images."""
+        return self._rows[keypoints, _LINK]
+
+    def side_by_side(self, begin: int, end: int) -> tuple[Int[np.ndarray, "T 2"], Float[np.ndarray, " T"]]:
+        """Pairs of tracks, smaller number first, with keypoints of one image within the radius, and their distances.
+
+        begin, end: the keypoints of the image. Distances are in units of the radius.
+        """
+        return _near_tracks(self._rows, self._values, begin, end, self._radius)
 
 
-def _follow(links: np.ndarray) -> np.ndarray:
-    target = links
-    while not np.array_equal(further := target[target], target):
-        target = further
-    return target
+@compiled
+def _root(rows: np.ndarray, keypoint: int) -> int:
+    root = keypoint
+    while rows[root, _PARENT] >= 0:
+        root = rows[root, _PARENT]
+    while keypoint != root:
+        above = rows[keypoint, _PARENT]
+        rows[keypoint, _PARENT] = root
+        keypoint = above
+    return root
 
 
-def link_tracks(
-    points: Float[np.ndarray, "K 2"],
-    images: Int[np.ndarray, " K"],
-    sigmas: Float[np.ndarray, " K"],
-    edges: Int[np.ndarray, "E 2"],
-    radius_px: float,
-    min_shared_images: int,
-) -> tuple[Int[np.ndarray, " K"], Int[np.ndarray, " K"]]:
-    """Join keypoints into tracks that hold at most one keypoint per image.
-
-    Two tracks are joined along an edge, strongest edge first, unless they have keypoints further apart than the radius
-    in one image; nearer ones become one. Then tracks that run within the radius of each other in every image they
-    share, at least `min_shared_images` of them, are joined too: without that, the tracks of a matcher that puts one
-    side of each match on a grid end wherever an image changes sides.
-
-    Args: points: image pixels. sigmas: image pixels per matcher pixel. edges: matched keypoints, strongest first.
-        radius_px: matcher pixels, the coarser of two keypoints; 0 joins none. min_shared_images: 0 skips the second
-        step.
-    Returns: track (K,): a number that the keypoints of a track share. representative (K,): the keypoint that each has
-        become part of, itself for most; one per track and image.
-    """
-    tracks = Tracks(points, images, sigmas, radius_px)
-    tracks.join(edges)
-    if radius_px > 0 and min_shared_images > 0:
-        roots = tracks.track()
-        tracks.join(_side_by_side(points, images, sigmas, roots, radius_px, min_shared_images), min_shared_images)
-    return tracks.track(), tracks.representative()
+@compiled
+def _roots(rows: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
+    found = np.empty(len(keypoints), np.int64)
+    for place in range(len(keypoints)):
+        root = keypoints[place]
+        while rows[root, _PARENT] >= 0:
+            root = rows[root, _PARENT]
+        found[place] = root
+    return found
 
 
-def _side_by_side(
-    points: np.ndarray, images: np.ndarray, sigmas: np.ndarray, roots: np.ndarray, radius_px: float, min_shared: int
-) -> np.ndarray:
-    """Pairs of tracks (T, 2) near each other in at least `min_shared` images: most images first, then nearest."""
-    keys, distances = [np.zeros(0, np.int64)], [np.zeros(0)]
-    order = np.argsort(images, kind="stable")
-    for here in np.split(order, np.flatnonzero(np.diff(images[order])) + 1):
-        if not len(here):
+@compiled
+def _stands(rows: np.ndarray, keypoint: int) -> int:
+    while rows[keypoint, _IMAGE] < 0:
+        keypoint = rows[keypoint, _LINK]
+    return keypoint
+
+
+@compiled
+def _standing(rows: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
+    found = np.empty(len(keypoints), np.int64)
+    for place in range(len(keypoints)):
+        found[place] = _stands(rows, keypoints[place])
+    return found
+
+
+@compiled
+def _join(
+    rows: np.ndarray, values: np.ndarray, stamps: np.ndarray, edges: np.ndarray, radius: float, min_shared: int
+) -> None:
+    for edge in range(len(edges)):
+        kept, gone = _root(rows, edges[edge, 0]), _root(rows, edges[edge, 1])
+        if kept == gone:
             continue
-        near = here[cKDTree(points[here]).query_pairs(radius_px * sigmas[here].max(), output_type="ndarray")]
-        distance = np.linalg.norm(points[near[:, 0]] - points[near[:, 1]], axis=1) / sigmas[near].max(axis=1)
-        pair = np.sort(roots[near], axis=1)
-        wanted = (distance <= radius_px) & (pair[:, 0] != pair[:, 1])
-        keys.append(pair[wanted, 0] * len(points) + pair[wanted, 1])
-        distances.append(distance[wanted])
-    key, index, shared = np.unique(np.concatenate(keys), return_inverse=True, return_counts=True)
-    mean_distance = np.bincount(index, np.concatenate(distances), len(key)) / np.maximum(shared, 1)
-    best_first = np.lexsort((key, mean_distance, -shared))
-    key = key[best_first][shared[best_first] >= min_shared]
-    return np.stack([key // max(len(points), 1), key % max(len(points), 1)], axis=1)
+        if rows[kept, _PARENT] > rows[gone, _PARENT]:
+            kept, gone = gone, kept
+        first = _stands(rows, gone)
+        member = first
+        while True:
+            stamps[rows[member, _IMAGE]] = member
+            member = rows[member, _LINK]
+            if member == first:
+                break
+        shared, fine = 0, True
+        entry = _stands(rows, kept)
+        member = entry
+        while True:
+            other = stamps[rows[member, _IMAGE]]
+            if other >= 0:
+                shared += 1
+                step_x = np.float64(values[member, _X]) - values[other, _X]
+                step_y = np.float64(values[member, _Y]) - values[other, _Y]
+                reach = radius * max(values[member, _SIGMA], values[other, _SIGMA])
+                if step_x**2 + step_y**2 > reach**2:
+                    fine = False
+                    break
+            member = rows[member, _LINK]
+            if member == entry:
+                break
+        if fine and shared >= min_shared:
+            rows[kept, _PARENT] = -_one_ring(rows, values, stamps, entry, first)
+            rows[gone, _PARENT] = kept
+            continue
+        member = first
+        while True:
+            stamps[rows[member, _IMAGE]] = -1
+            member = rows[member, _LINK]
+            if member == first:
+                break
 
 
-def local_affine(
-    points0: Float[np.ndarray, "M 2"], points1: Float[np.ndarray, "M 2"], trusted: Bool[np.ndarray, " M"]
-) -> Float[np.ndarray, "M 2 2"]:
-    """How a small step from each match in image 0 continues in image 1.
+@compiled
+def _one_ring(rows: np.ndarray, values: np.ndarray, stamps: np.ndarray, entry: int, first: int) -> int:
+    """One ring of two, with the finer of two keypoints of an image.
 
-    A reweighted least-squares fit to the nearest trusted matches, drawn to one map of the whole pair; the identity
-    where fewer than four are trusted.
-
-    Args: points of one pair's matches, pixels. trusted: which may be fitted to; outliers among them weigh less.
-    Returns: (M, 2, 2) Jacobians of the map from image 0 to image 1.
+    Args: entry, first: a keypoint of either. stamps: the keypoint of the second ring in every image, -1 for none; they
+        are cleared.
+    Returns: the length of the ring.
     """
-    base0, base1 = points0[trusted], points1[trusted]
-    if len(base0) < 4:
-        return np.tile(np.eye(2), (len(points0), 1, 1))
-    # Steps across half the pair: long against the noise, and no outlier can shift an origin.
-    far = np.roll(np.arange(len(base0)), len(base0) // 2)
-    whole = _reweighted_affine((base0[far] - base0)[None], (base1[far] - base1)[None], np.eye(2))[0]
-    _, rows = cKDTree(base0).query(points0, min(_NEIGHBOURS + 1, len(base0)))
-    return _reweighted_affine(base0[rows] - points0[:, None], base1[rows] - points1[:, None], whole)
+    head, last, count = -1, -1, 0
+    for start in (entry, first):
+        member = start
+        while True:
+            follower, image = rows[member, _LINK], rows[member, _IMAGE]
+            other, stays = stamps[image], True
+            if start == entry and other >= 0:
+                stays = values[other, _SIGMA] >= values[member, _SIGMA]
+                if stays:
+                    stamps[image] = -2 - member  # told to the other one when its turn comes
+                else:
+                    rows[member, _LINK] = other
+            elif start == first:
+                stays = other >= 0
+                if not stays:
+                    rows[member, _LINK] = -2 - other
+                stamps[image] = -1
+            if not stays:
+                rows[member, _IMAGE] = -1 - image
+            else:
+                if head < 0:
+                    head = member
+                else:
+                    rows[last, _LINK] = member
+                last = member
+                count += 1
+            member = follower
+            if member == start:
+                break
+    rows[last, _LINK] = head
+    return count
 
 
-def _reweighted_affine(steps0: np.ndarray, steps1: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """Linear maps (N, 2, 2) from steps0 (N, k, 2) to steps1 (N, k, 2), steps that disagree weighing less."""
-    size = np.maximum(np.median((steps0**2).sum(axis=2), axis=1), 1e-12)[:, None, None] * np.eye(2)
-    linear = np.broadcast_to(prior, (len(steps0), 2, 2))
-    for _ in range(_AFFINE_ROUNDS):
-        residual = np.linalg.norm(steps1 - steps0 @ linear.transpose(0, 2, 1), axis=2)
-        scale = np.maximum(np.median(residual, axis=1, keepdims=True), 1e-9)
-        weighted = steps0 / (1 + (residual / scale) ** 2)[:, :, None]
-        linear = (steps1.transpose(0, 2, 1) @ weighted + prior @ size) @ np.linalg.inv(
-            steps0.transpose(0, 2, 1) @ weighted + size
-        )
-    return linear
+@compiled
+def _settle(rows: np.ndarray, values: np.ndarray, begin: int, weights: np.ndarray, octave: float) -> None:
+    for place in range(len(weights)):
+        keypoint = begin + place
+        stands = _stands(rows, keypoint)
+        if stands == keypoint or values[keypoint, _SIGMA] >= octave * values[stands, _SIGMA]:
+            continue
+        share = weights[place] / (weights[place] + weights[stands - begin])
+        for axis in (_X, _Y):
+            values[stands, axis] += share * (values[keypoint, axis] - values[stands, axis])
+        weights[stands - begin] += weights[place]
+    for keypoint in range(begin, begin + len(weights)):
+        if rows[keypoint, _IMAGE] >= 0:
+            rows[keypoint, _LINK] = -1
 
 
-def align_keypoints(
-    keypoints: Float[np.ndarray, "K 2"],
-    sigmas: Float[np.ndarray, " K"],
-    index: Int[np.ndarray, "2 M"],
-    points: Float[np.ndarray, "2 M 2"],
-    affine: Float[np.ndarray, "M 2 2"],
-    variances: Float[np.ndarray, " M"],
-    weights: Float[np.ndarray, " M"],
-) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, " M"]]:
-    """Move keypoints to where the matches between them agree best.
-
-    Least squares over x1 = p1 + A (x0 - p0), which holds when keypoints x0, x1 show the same spot near the match
-    p0, p1 with local map A, each equation weighing weight / variance, and a weak pull to where a keypoint started.
-
-    Args: keypoints, sigmas: start and image pixels per matcher pixel. index: the keypoints of both sides of a match.
-        variances: squared image-1 pixels.
-    Returns: the aligned keypoints; for every match the residual in standard deviations.
-    """
-    count, (side0, side1) = len(keypoints), index
-    offset = points[1] - np.einsum("mij,mj->mi", affine, points[0])
-    root_weight = np.sqrt(weights / variances)
-    row = 2 * np.arange(len(side0))
-    entries = [
-        (row + axis, column, root_weight * factor)
-        for axis in (0, 1)
-        for column, factor in (
-            (2 * side1 + axis, np.ones(len(side0))),
-            (2 * side0, -affine[:, axis, 0]),
-            (2 * side0 + 1, -affine[:, axis, 1]),
-        )
-    ]
-    rows, columns, values = (np.concatenate(part) for part in zip(*entries, strict=True))
-    system = csr_matrix((values, (rows, columns)), shape=(2 * len(side0), 2 * count))
-    prior = np.repeat(_PRIOR_WEIGHT / np.where(np.isfinite(sigmas), sigmas, 1.0) ** 2, 2)
-    normal = (system.T @ system + diags(prior)).tocsr()
-    right = system.T @ (root_weight[:, None] * offset).ravel() + prior * keypoints.ravel()
-    start = keypoints.ravel()
-    solution, _ = cg(normal, right, x0=start, rtol=1e-7, maxiter=300, M=diags(1 / normal.diagonal()))
-    aligned = solution.reshape(-1, 2)
-    residual = aligned[side1] - offset - np.einsum("mij,mj->mi", affine, aligned[side0])
-    return aligned, np.linalg.norm(residual, axis=1) / np.sqrt(variances)
+@compiled
+def _near_tracks(
+    rows: np.ndarray, values: np.ndarray, begin: int, end: int, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    coarsest, count = np.float64(0.0), 0
+    standing, roots = np.empty(end - begin, np.int64), np.empty(end - begin, np.int64)
+    points = np.empty((end - begin, 2))
+    for keypoint in range(begin, end):
+        if rows[keypoint, _IMAGE] < 0:
+            continue
+        coarsest = max(coarsest, np.float64(values[keypoint, _SIGMA]))
+        points[count, 0], points[count, 1] = values[keypoint, _X], values[keypoint, _Y]
+        root = keypoint
+        while rows[root, _PARENT] >= 0:
+            root = rows[root, _PARENT]
+        standing[count], roots[count] = keypoint, root
+        count += 1
+    points = points[:count]
+    widest = radius * coarsest
+    frame, start, order = grid_of(points, widest / 2)
+    lines = int(frame[4])
+    pairs, distances = np.empty((64, 2), np.int64), np.empty(64)
+    count = 0
+    for one in range(len(points)):
+        left, right, top, bottom = cells_around(frame, points[one, 0], points[one, 1], widest)
+        for column in range(left, right):
+            for place in range(start[column * lines + top], start[column * lines + bottom]):
+                other = order[place]
+                if other <= one:
+                    continue
+                sigma = max(values[standing[one], _SIGMA], values[standing[other], _SIGMA])
+                reach = radius * np.float64(sigma)
+                squared = (points[one, 0] - points[other, 0]) ** 2 + (points[one, 1] - points[other, 1]) ** 2
+                if squared > reach * reach:
+                    continue
+                if count == len(pairs):
+                    pairs, distances = np.concatenate((pairs, pairs)), np.concatenate((distances, distances))
+                pairs[count, 0], pairs[count, 1] = min(roots[one], roots[other]), max(roots[one], roots[other])
+                distances[count] = np.sqrt(squared) / reach
+                count += 1
+    return pairs[:count], distances[:count]

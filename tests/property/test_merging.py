@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sgam_core.types import Matches
-from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions, merge_keypoints
+from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions
+from sgam_sfm.merging import merge_keypoints
 from sgam_sfm.tracks import Tracks
 
 NAMES = ("a", "b", "c", "d")
@@ -92,6 +93,24 @@ def test_the_order_of_pairs_changes_nothing_and_a_reversed_pair_has_reversed_mat
         np.testing.assert_array_equal(merged.scores[a, b], expected.scores[min(a, b), max(a, b)])
 
 
+@settings(max_examples=15, deadline=None)
+@given(collections(), st.integers(1, 40), st.integers(1, 40))
+def test_the_size_of_the_pieces_changes_nothing(pairs, matches_at_once, rows_a_part):
+    expected = merge_keypoints(pairs)
+    with (
+        mock.patch("sgam_sfm.merging._AT_ONCE", matches_at_once),
+        mock.patch("sgam_sfm.merging._ROWS_A_PART", rows_a_part),
+        mock.patch("sgam_sfm.scratch._BUFFERED", 8 * rows_a_part),
+        mock.patch("sgam_sfm.scratch._ROWS_AT_ONCE", rows_a_part),
+    ):
+        merged = merge_keypoints(pairs)
+    for name in expected.keypoints:
+        np.testing.assert_array_equal(merged.keypoints[name], expected.keypoints[name])
+    for pair in expected.matches:
+        np.testing.assert_array_equal(merged.matches[pair], expected.matches[pair])
+        np.testing.assert_array_equal(merged.scores[pair], expected.scores[pair])
+
+
 @settings(max_examples=30, deadline=None)
 @given(collections(), st.sampled_from([0.5, 2.0, 8.0]))
 def test_a_larger_image_with_a_larger_sigma_gives_the_same_tracks(pairs, zoom):
@@ -114,7 +133,7 @@ def test_a_larger_image_with_a_larger_sigma_gives_the_same_tracks(pairs, zoom):
 
 
 def one_after_the_other(points, images, sigmas, edges, radius):
-    """What `_Tracks.join` must come to, edge by edge: track and standing keypoint of every keypoint.
+    """What `Tracks.join` must come to, edge by edge: track and standing keypoint of every keypoint.
 
     edges: (a, b, images that both tracks must be in).
     """
@@ -138,16 +157,15 @@ def one_after_the_other(points, images, sigmas, edges, radius):
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_joining_at_once_is_joining_one_after_the_other(seed):
+def test_joining_is_what_it_says(seed):
     rng = np.random.default_rng(seed)
     count, num_images, num_edges = (int(rng.integers(1, top)) for top in (60, 8, 120))
     points, images = rng.uniform(0, rng.choice([5, 20, 100]), (count, 2)), rng.integers(0, num_images, count)
     sigmas, radius = rng.choice([1.0, 1.0, 2.0], count), float(rng.choice([0, 2, 5]))
     edges, half = rng.integers(0, count, (num_edges, 2)), num_edges // 2
     made = Tracks(points, images, sigmas, radius)
-    with mock.patch("sgam_sfm.tracks._EDGES_AT_ONCE", int(rng.integers(1, 100))):
-        made.join(edges[:half])
-        made.join(edges[half:], min_shared=1)
+    made.join(edges[:half])
+    made.join(edges[half:], min_shared=1)
     needed = [(a, b, int(row >= half)) for row, (a, b) in enumerate(edges.tolist())]
     root, stands = one_after_the_other(points, images, sigmas, needed, radius)
     np.testing.assert_array_equal(made.track(), root)

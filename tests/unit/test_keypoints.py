@@ -3,8 +3,12 @@ import pytest
 
 from sgam_core.errors import InputError, OptionError, ShapeError
 from sgam_core.types import Matches
-from sgam_sfm.keypoints import KeypointOptions, merge_image, merge_keypoints
-from sgam_sfm.tracks import align_keypoints, link_tracks, local_affine
+from sgam_sfm.affine import local_affine
+from sgam_sfm.alignment import align_keypoints, offsets_of
+from sgam_sfm.clusters import merge_image
+from sgam_sfm.keypoints import KeypointOptions
+from sgam_sfm.merging import merge_keypoints
+from sgam_sfm.tracks import Tracks
 
 
 def matches(points0, points1, scores=None, sigma=1.0):
@@ -126,13 +130,12 @@ def test_tracks_side_by_side_are_joined_only_when_enough_images_show_both():
         assert len(merge_keypoints(pairs, options).keypoints["b"]) == 2
 
 
-def test_link_tracks_keeps_the_finer_of_two_keypoints_that_become_one():
+def test_a_track_keeps_the_finer_of_two_keypoints_that_become_one():
     points = np.array([[10.0, 10.0], [12.0, 10.0], [50.0, 50.0]])
-    track, representative = link_tracks(
-        points, np.array([0, 0, 1]), np.array([3.0, 1.0, 1.0]), np.array([[0, 2], [1, 2]]), 1.0, 0
-    )
-    assert len(set(track.tolist())) == 1
-    np.testing.assert_array_equal(representative, [1, 1, 2])
+    tracks = Tracks(points, np.array([0, 0, 1]), np.array([3.0, 1.0, 1.0]), 1.0)
+    tracks.join(np.array([[0, 2], [1, 2]]))
+    assert len(set(tracks.track().tolist())) == 1
+    np.testing.assert_array_equal(tracks.representative(), [1, 1, 2])
 
 
 def test_a_match_far_from_its_aligned_keypoints_is_dropped():
@@ -161,17 +164,15 @@ def test_local_affine_of_three_matches_is_the_identity():
 
 def test_align_keypoints_weighs_by_variance_and_carries_matches_along_the_affine_map():
     # x1 = 5 + 2 (x0 - 1) with x0 held at 1.5 by a hundredfold weight of its own point: x1 = 6.
-    aligned, residuals = align_keypoints(
-        np.array([[1.5, 0.0], [5.0, 0.0]]),
-        np.array([1e-3, 1e3]),
-        np.array([[0], [1]]),
-        np.array([[[1.0, 0.0]], [[5.0, 0.0]]]),
-        2 * np.eye(2)[None],
-        np.array([1.0]),
-        np.array([1.0]),
-    )
-    np.testing.assert_allclose(aligned, [[1.5, 0.0], [6.0, 0.0]], atol=1e-3)
-    np.testing.assert_allclose(residuals, [0.0], atol=1e-3)
+    keypoints, index, affine = np.array([[1.5, 0.0], [5.0, 0.0]]), np.array([[0, 1]]), np.array([[2.0, 0.0, 0.0, 2.0]])
+    match, slots = np.array([[1.0, 0.0, 5.0, 0.0]]), np.full(2, -1)
+    offsets = offsets_of(keypoints, index, match, affine)
+    np.testing.assert_allclose(offsets, [[-1.0, 0.0]])
+    sigmas, track, weight = np.array([1e-3, 1e3]), np.array([7]), np.array([1.0])
+    align_keypoints(keypoints, sigmas, slots, index, track, offsets, affine, weight)
+    np.testing.assert_allclose(keypoints, [[1.5, 0.0], [6.0, 0.0]], atol=1e-3)
+    np.testing.assert_allclose(offsets_of(keypoints, index, match, affine), [[0.0, 0.0]], atol=1e-3)
+    np.testing.assert_array_equal(slots, [-1, -1])
 
 
 def test_empty_pairs_and_an_empty_collection_give_empty_keypoints():

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from sgam_core import Matches, PairResult
+from sgam_core import Area, AreaMatch, Box, Matches, PairResult, TwoViewModel
 from sgam_core.errors import InputError
-from sgam_sfm.store import PairRecord, PairStore, read_outcomes
+from sgam_sfm.store import PairRecord, PairStore, read_outcomes, read_pair_outcomes
 
 PAIRS = (("a.jpg", "b.jpg"), ("a.jpg", "c.jpg"))
 
@@ -78,23 +80,33 @@ def test_a_block_that_was_cut_short_is_not_there(store, length, caplog):
 
 
 def replace_points(file: h5py.File, array: object) -> None:
-    del file["0/points0"]
-    file["0/points0"] = array
+    del file["points0"]
+    file["points0"] = array
 
 
 def huge(file: h5py.File) -> None:
-    del file["0/points0"]
-    file["0"].create_dataset("points0", shape=(10**12, 2), dtype="f4", chunks=(1024, 2))
+    del file["points0"]
+    file.create_dataset("points0", shape=(10**12, 2), dtype="f4", chunks=(1024, 2))
 
 
 def elsewhere(file: h5py.File) -> None:
-    del file["0"]
-    file["0"] = h5py.ExternalLink("/etc/passwd", "/0")
+    del file["facts"]
+    file["facts"] = h5py.ExternalLink("/etc/passwd", "/facts")
 
 
 def of_another_kind(file: h5py.File) -> None:
-    del file["0/points0"]
-    file.create_group("0/points0")
+    del file["points0"]
+    file.create_group("points0")
+
+
+def telling(facts: object) -> Callable[[h5py.File], None]:
+    """Facts of a block as someone would write them."""
+
+    def change(file: h5py.File) -> None:
+        del file["facts"]
+        file["facts"] = np.frombuffer(json.dumps(facts).encode(), np.uint8)
+
+    return change
 
 
 FORGERIES = {
@@ -103,11 +115,14 @@ FORGERIES = {
     "a group": of_another_kind,
     "text": lambda file: replace_points(file, [b"1"] * 40),
     "other shape": lambda file: replace_points(file, np.zeros((40, 3))),
+    "fewer points": lambda file: replace_points(file, np.zeros((30, 2))),
     "a pickle": lambda file: replace_points(file, np.void(b"\x80\x04\x95")),
-    "no attributes": lambda file: file["0"].attrs.clear(),
-    "facts that are none": lambda file: file["0/facts"].write_direct(np.array(b"[]", dtype=object)),
-    "no facts": lambda file: file["0"].pop("facts"),
-    "missing": lambda file: file.pop("0"),
+    "no names": telling([{"error": ""}, {"error": ""}]),
+    "numbers": telling([1, 2]),
+    "no JSON": lambda file: file["facts"].write_direct(np.full(file["facts"].shape, 255, np.uint8)),
+    "facts of other pairs": telling([]),
+    "no facts": lambda file: file.pop("facts"),
+    "no ends": lambda file: file.pop("ends"),
 }
 
 
@@ -127,3 +142,67 @@ def test_outcomes(store, tmp_path: Path):
     (tmp_path / "text.h5").write_text("text")
     with pytest.raises(InputError, match="is not a file of pair results"):
         read_outcomes(tmp_path / "text.h5")
+
+
+def result_of(count, **changes):
+    rng = np.random.default_rng(count)
+    area = Area(box=Box(x0=1.0, y0=2.0, x1=30.0, y1=40.0), kind="object", label=3)
+    values = {
+        "matches": Matches(
+            points0=rng.uniform(0, 99, (count, 2)).astype(np.float32),
+            points1=rng.uniform(0, 99, (count, 2)).astype(np.float32),
+            scores=rng.random(count),
+            sigmas0=np.full(count, 1.5),
+            area_index=np.zeros(count, np.int32),
+        ),
+        "areas": (AreaMatch(area0=area, area1=area, distance=0.25),),
+        "two_view": TwoViewModel(F=np.eye(3), calibrated=True, num_inliers=2, num_matches=count, planarity=0.5),
+        "coverage0": 0.4,
+        "coverage1": 0.6,
+        "whole_scale0": 0.5,
+        "whole_scale1": 0.5,
+    }
+    return PairResult(**(values | changes))
+
+
+RECORDS = (
+    PairRecord(pair=("a", "b"), result=result_of(3)),
+    PairRecord(pair=("a", "c"), result=None, error="cannot be read"),
+    PairRecord(pair=("b", "ü"), result=result_of(0, two_view=None, areas=(), fallback="no areas", notes=("limit",))),
+    PairRecord(pair=("c", "d"), result=result_of(2)),
+)
+
+
+def assert_same(read, written):
+    assert [record.pair for record in read] == [record.pair for record in written]
+    for one, other in zip(read, written, strict=True):
+        assert one.error == other.error
+        assert (one.result is None) == (other.result is None)
+        if one.result is None:
+            continue
+        for name in ("areas", "coverage0", "coverage1", "whole_scale0", "fallback", "notes"):
+            assert getattr(one.result, name) == getattr(other.result, name)
+        for name in ("points0", "points1", "scores", "sigmas0", "sigmas1", "area_index"):
+            np.testing.assert_array_equal(getattr(one.result.matches, name), getattr(other.result.matches, name))
+        assert (one.result.two_view is None) == (other.result.two_view is None)
+        if one.result.two_view is not None:
+            np.testing.assert_array_equal(one.result.two_view.F, np.eye(3))
+            assert one.result.two_view.num_inliers == 2
+
+
+def test_a_block_is_read_as_it_was_written(tmp_path):
+    store = PairStore(folder=tmp_path / "pairs", fingerprint="x")
+    store.write(0, RECORDS)
+    store.write(1, RECORDS[1:2])  # no match at all
+    assert_same(list(store.read_all(2)), RECORDS + RECORDS[1:2])
+    outcomes = [(o.pair, o.block, o.error, o.fallback) for o in read_pair_outcomes(tmp_path)]
+    assert outcomes == [
+        (("a", "b"), 0, "", ""),
+        (("a", "c"), 0, "cannot be read", ""),
+        (("b", "ü"), 0, "", "no areas"),
+        (("c", "d"), 0, "", ""),
+        (("a", "c"), 1, "cannot be read", ""),
+    ]
+    assert store.has(0)
+    with pytest.raises(InputError, match="was made from other images, pairs or options"):
+        PairStore(folder=store.folder, fingerprint="y").has(0)
