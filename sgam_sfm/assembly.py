@@ -6,13 +6,19 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
+
+import cv2
+import numpy as np
 
 from sgam_core.geometry import residuals
 from sgam_sfm.colmap_reading import read_camera_ids, read_counts, read_match_counts
 from sgam_sfm.hloc_files import matches_h5_size, write_keypoints_h5, write_matches_h5
+from sgam_sfm.images import read_image
 from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions
 from sgam_sfm.mapping import (
     MappingOptions,
@@ -22,27 +28,36 @@ from sgam_sfm.mapping import (
     map_images,
     verify,
 )
-from sgam_sfm.merging import RawPair, merging
+from sgam_sfm.merging import Photos, RawPair, merging
 from sgam_sfm.progress import Advance, Stages
 from sgam_sfm.store import PairRecord
 
 _log = logging.getLogger(__name__)
 
 _LARGEST_MATCHES_H5 = 2**31  # bytes
+_PHOTOS_IN_MEMORY = 32  # of one byte a pixel
 
 
 @contextmanager
 def merged_records(
-    records: Iterable[PairRecord], options: KeypointOptions, max_residual: float, output: Path
+    records: Iterable[PairRecord], options: KeypointOptions, max_residual: float, output: Path, images: Path
 ) -> Iterator[CollectionKeypoints]:
     """Keypoints from the raw matches of all pairs; their arrays can be read inside the context.
 
     Args: max_residual: of an inlier of its pair's geometry, see `GeometryOptions`. output: is given a folder for the
-        arrays, which is removed at the end.
+        arrays, which is removed at the end. images: folder of the photos, read when keypoints are refined.
     """
     raw = (_raw_pair(record, max_residual) for record in records if record.result and len(record.result.matches))
-    with merging(raw, output, options) as merged:
+    with merging(raw, output, options, _photos(images)) as merged:
         yield merged
+
+
+def _photos(folder: Path) -> Photos:
+    @lru_cache(_PHOTOS_IN_MEMORY)
+    def gray(name: str) -> np.ndarray:
+        return cv2.cvtColor(read_image(folder / name, sys.maxsize), cv2.COLOR_RGB2GRAY)
+
+    return gray
 
 
 def _raw_pair(record: PairRecord, max_residual: float) -> RawPair:

@@ -19,6 +19,7 @@ class KeypointOptions:
     track_radius_px: float = 5.0  # keypoints of one image within it may become one in a track; 0: never
     min_shared_images: int = 1  # join two tracks that run within the track radius in so many images; 0: never
     max_residual_sigmas: float = 1.0  # drop a match further from its aligned keypoints; sigma: 1 px either side; 0: off
+    refine: bool = False  # move keypoints, in the end, to where the photos themselves agree best, at full resolution
 
     def __post_init__(self) -> None:
         if not self.cluster_radius_px > 0:

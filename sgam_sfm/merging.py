@@ -11,6 +11,9 @@ A semi-dense matcher gives every pair points of its own, so its raw matches make
    local affine map of its pair.
 4. Matches that still disagree with their keypoints are dropped.
 
+With the photos, step 3 is done once more: each match is measured again at its keypoints, by aligning the patches around
+them at full resolution.
+
 Distances are in matcher pixels (image pixels / sigma), so that coarse and fine matches are judged alike. The input is
 only read: merging can be repeated with other options.
 
@@ -39,6 +42,7 @@ from sgam_sfm.alignment import offsets_of
 from sgam_sfm.clusters import finest_and_weight, merge_image
 from sgam_sfm.compiled import compiled
 from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions
+from sgam_sfm.matchers.subpixel import refine
 from sgam_sfm.pairs import Pair
 from sgam_sfm.scratch import Rows, Scratch, batches, in_order
 from sgam_sfm.tracks import Tracks
@@ -53,6 +57,11 @@ _ROWS_A_PART = 2**18  # rows that are sorted in memory
 _STEPS = 16  # of strength in an octave: a stronger match joins first, those alike in the order of their pairs
 _SHARED = 1000  # no two tracks share more images, as far as their order is concerned
 
+_PATCHES_AT_ONCE = 2**13
+_LARGEST_MOVE = 2.0  # matcher pixels: what moves further has slid along an edge
+_SURE_CORRELATION = 0.85  # of two patches whose alignment counts
+_MEASURED_VARIANCE = 0.05  # of a match that was measured again, against what it was before
+
 # The columns of a match: its points, sigmas and score, its variance in squared image-1 pixels (below 0 for one that
 # does not agree with the geometry of its pair) and the local affine map from image 0 to image 1.
 _POINTS, _SIGMAS, _SCORE, _VARIANCE, _AFFINE = slice(0, 4), slice(4, 6), 6, 7, slice(8, 12)
@@ -60,6 +69,9 @@ _WIDTH = 12
 
 RawPair = tuple[Pair, Matches, np.ndarray | None]
 """A pair, its matches, and (M,) which of them agree with its geometry; None for all."""
+
+Photos = Callable[[str], np.ndarray]
+"""The gray values (H, W) of an image, uint8, by its name; threads may ask."""
 
 Key = TypeVar("Key")
 
@@ -127,11 +139,12 @@ def merge_keypoints(
 
 @contextmanager
 def merging(
-    pairs: Iterable[RawPair], output: Path, options: KeypointOptions | None = None
+    pairs: Iterable[RawPair], output: Path, options: KeypointOptions | None = None, photos: Photos | None = None
 ) -> Iterator[CollectionKeypoints]:
     """`merge_keypoints` for collections of any size: the arrays are read from disk when they are asked for.
 
     Args: output: gets a folder of up to about 130 bytes a match, which is removed at the end of the context.
+        photos: asked for when the options say `refine`.
     """
     options = options or KeypointOptions()
     with Scratch(output / _FOLDER) as scratch:
@@ -146,6 +159,9 @@ def merging(
         for begin, end in pairwise(bounds.tolist()):
             tracks.settle(begin, told.read(begin, end - begin)[:, 3], _OCTAVE)
         num_conflicts = _align(raw, tracks, scratch)
+        if options.refine and photos is not None:
+            _measure_again(raw, tracks, photos, options.max_residual_sigmas)
+            _align(raw, tracks, scratch)
         merged = _export(raw, tracks, bounds, options.max_residual_sigmas, num_conflicts, scratch)
         del tracks
         _log.info(
@@ -352,6 +368,48 @@ def _align(raw: _Raw, tracks: Tracks, scratch: Scratch) -> int:
     return num_matches - num_linked
 
 
+def _measure_again(raw: _Raw, tracks: Tracks, photos: Photos, max_residual_sigmas: float) -> None:
+    """Replace the points of matches by their keypoints in image 0 and what looks most like these in image 1.
+
+    Matches that disagree with their keypoints, or whose patches do not look alike, stay as they are.
+    """
+
+    def of_pair(pair: _PairRows) -> None:
+        kept, index, _ = _linked(raw, tracks, pair)
+        rows = raw.rows.read(pair.begin, pair.length)
+        part = rows[kept]
+        agree = _agreeing(tracks, index, part, max_residual_sigmas)
+        kept, part = kept[agree], part[agree]
+        points = tracks.points(index[agree].ravel()).reshape(-1, 2, 2)
+        affine = local_affine(points[:, 0], points[:, 1], part[:, _VARIANCE] > 0)
+        coarsest = 2 ** int(np.ceil(np.log2(max(float(np.median(part[:, _SIGMAS])), 1.0)))) if len(part) else 1
+        strides = tuple(stride for stride in (8, 4, 2, 1) if stride <= coarsest)
+        gray0, gray1 = (photos(name).astype(np.float32) for name in sorted(pair.pair))
+        for begin in range(0, len(part), _PATCHES_AT_ONCE):
+            here = slice(begin, begin + _PATCHES_AT_ONCE)
+            points0, points1 = points[here, 0], points[here, 1]
+            found, correlation = refine(gray0, gray1, points0, points1, affine[here], strides=strides)
+            near = np.linalg.norm(found - points1, axis=1) <= _LARGEST_MOVE * part[here, _SIGMAS][:, 1]
+            sure = near & (correlation > _SURE_CORRELATION)
+            changed = part[here][sure]
+            changed[:, _POINTS] = np.column_stack([points0, found])[sure]
+            changed[:, _AFFINE] = affine[here][sure].reshape(-1, 4)
+            changed[:, _VARIANCE] *= _MEASURED_VARIANCE
+            rows[kept[here][sure]] = changed
+        raw.rows.write(pair.begin, rows)
+
+    for _ in in_order(of_pair, (pair for pair in raw.pairs if pair.length)):
+        pass
+
+
+def _agreeing(tracks: Tracks, index: np.ndarray, rows: np.ndarray, max_residual_sigmas: float) -> np.ndarray:
+    """Which matches lie where their keypoints say."""
+    if max_residual_sigmas <= 0:
+        return np.ones(len(rows), bool)
+    error = np.linalg.norm(_offsets(tracks, index, rows), axis=1)
+    return error <= max_residual_sigmas * np.sqrt(np.abs(rows[:, _VARIANCE]))
+
+
 def _offsets(tracks: Tracks, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
     points = tracks.points(index.ravel())
     places = np.arange(2 * len(index)).reshape(-1, 2)
@@ -368,10 +426,8 @@ def _export(
         for pair in batch:
             kept, index, _ = _linked(raw, tracks, pair)
             rows = raw.rows.read(pair.begin, pair.length)[kept]
-            if max_residual_sigmas > 0:
-                error = np.linalg.norm(_offsets(tracks, index, rows), axis=1)
-                agree = error <= max_residual_sigmas * np.sqrt(np.abs(rows[:, _VARIANCE]))
-                index, rows = index[agree], rows[agree]
+            agree = _agreeing(tracks, index, rows, max_residual_sigmas)
+            index, rows = index[agree], rows[agree]
             found.append((*_best_of(index, rows[:, _SCORE]), len(index)))
         return found
 

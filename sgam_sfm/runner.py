@@ -119,7 +119,8 @@ def assemble(
     options, inputs, output = job.options, job.inputs, job.options.output
     with stages.stage("Merging keypoints", None):
         counted = CountedPairs(store.read_all(num_blocks))
-        with merged_records(counted, options.keypoints, options.geometry.max_residual, output) as merged:
+        limit = options.geometry.max_residual
+        with merged_records(counted, options.keypoints, limit, output, options.images) as merged:
             write = write_database if existing is None else append_to_database
             write(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
             write_for_hloc(merged, output)

@@ -85,7 +85,7 @@ class Sorted:
     """Rows under labels; those of a label stay in the order in which they came. In a file per label."""
 
     def __init__(self, folder: Path, width: int, dtype: type[np.generic]) -> None:
-        folder.mkdir()
+        folder.mkdir(exist_ok=True)
         self._folder, self._width, self._dtype = folder, width, np.dtype(dtype)
         self._waiting: dict[int, list[np.ndarray]] = defaultdict(list)
         self._bytes = 0

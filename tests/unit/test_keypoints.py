@@ -7,8 +7,9 @@ from sgam_sfm.affine import local_affine
 from sgam_sfm.alignment import align_keypoints, offsets_of
 from sgam_sfm.clusters import merge_image
 from sgam_sfm.keypoints import KeypointOptions
-from sgam_sfm.merging import merge_keypoints
+from sgam_sfm.merging import merge_keypoints, merging
 from sgam_sfm.tracks import Tracks
+from tests.textures import similarity, transfer, view
 
 
 def matches(points0, points1, scores=None, sigma=1.0):
@@ -195,3 +196,39 @@ def test_wrong_input_is_named():
         KeypointOptions(cluster_radius_px=0)
     with pytest.raises(OptionError, match=r"^track_radius_px is -1; expected 0 \(off\) or a positive number$"):
         KeypointOptions(track_radius_px=-1)
+
+
+def test_keypoints_are_measured_again_in_the_photos(tmp_path):
+    size = (320, 240)
+    warps = {
+        "a": np.eye(3),
+        "b": similarity(1.15, 8, (6.4, -3.3), (160, 120)),
+        "c": similarity(0.9, -6, (-4.7, 5.6), (160, 120)),
+    }
+    photos = {name: view(warp, size)[..., 0] for name, warp in warps.items()}
+    spots = np.stack(np.meshgrid(np.arange(50, 270, 9), np.arange(50, 190, 9)), -1).reshape(-1, 2) + 0.5
+    rng = np.random.default_rng(0)
+    noisy = {name: transfer(warp, spots) + rng.normal(0, 0.5, spots.shape) for name, warp in warps.items()}
+    pairs = [
+        ((one, other), matches(noisy[one], noisy[other], sigma=2.0), None)
+        for one, other in (("a", "b"), ("a", "c"), ("b", "c"))
+    ]
+
+    def error(options):
+        with merging(pairs, tmp_path, options, photos.__getitem__) as merged:
+            index = merged.matches["a", "b"]
+            points0, points1 = (merged.keypoints[name][index[:, side]] for side, name in enumerate("ab"))
+        distances = np.linalg.norm(transfer(warps["b"], points0) - points1, axis=1)
+        return len(index), float(np.median(distances))
+
+    before, after = (error(KeypointOptions(refine=refine)) for refine in (False, True))
+    assert after[0] > 0.9 * before[0] > 100
+    assert before[1] > 0.3
+    assert after[1] < 0.1  # of which the local maps between noisy matches are most
+
+
+def test_local_maps_are_exact_for_matches_in_the_order_of_a_grid():
+    spots = np.stack(np.meshgrid(np.arange(50.0, 270, 9), np.arange(50.0, 190, 9)), -1).reshape(-1, 2)
+    warp = similarity(1.15, 8, (6.4, -3.3), (160, 120))
+    maps = local_affine(spots, transfer(warp, spots), np.ones(len(spots), bool))
+    np.testing.assert_allclose(maps, np.broadcast_to(warp[:2, :2], maps.shape), atol=5e-3)
