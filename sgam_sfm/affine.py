@@ -26,8 +26,8 @@ def local_affine(
     base0, base1 = points0[trusted], points1[trusted]
     if len(base0) < 4:
         return np.tile(np.eye(2), (len(points0), 1, 1))
-    # Steps across the pair: long against the noise, and no outlier can shift an origin. In no order: matches may come row
-    # by row of a grid, where a fixed distance in their order is a fixed step, which tells one direction only.
+    # Steps across the pair: long against the noise, and no outlier can shift an origin. In no order: matches may come
+    # row by row of a grid, where a fixed distance in their order is a fixed step, which tells one direction only.
     far = np.random.default_rng(0).permutation(len(base0))
     spare = np.empty((2, len(far)))
     whole = _reweighted_affine(base0[far] - base0, base1[far] - base1, (1.0, 0.0, 0.0, 1.0), spare)

@@ -36,7 +36,9 @@ def load(settings):
     options.dim_feedforward = CHANNELS[options.layer]
     torch.set_grad_enabled(False)
     network = build_model(options)
-    utils.safe_load_weights(network, torch.load(settings.weights, map_location="cpu")["model_state_dict"])
+    utils.safe_load_weights(
+        network, torch.load(settings.weights, map_location="cpu", weights_only=True)["model_state_dict"]
+    )
     engine = SparseEngine(network.eval().to(settings.device), BATCH, mode="tile")
 
     def match_pair(image0, image1):

@@ -29,7 +29,9 @@ def load(settings):
     config = get_cfg_defaults()
     config.merge_from_file(os.path.join(folder, sys.argv[2] if len(sys.argv) > 2 else CONFIG))
     network = LoFTR(config=lower_config(config)["loftr"])
-    network.load_state_dict(torch.load(settings.weights, map_location="cpu")["state_dict"], strict=True)
+    network.load_state_dict(
+        torch.load(settings.weights, map_location="cpu", weights_only=True)["state_dict"], strict=True
+    )
     network = network.eval().to(settings.device)
 
     def frame(image):

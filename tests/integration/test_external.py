@@ -356,7 +356,7 @@ def test_label_maps_and_names_of_a_segmenter(write, images):
     with closing(ExternalSegmenter(worker=command(script, "segmenter"))) as segmenter:
         gone = replace(images[0], path=images[0].path.with_name("gone.png"))
         results = [labels for _, labels in segmenter.segment([gone, images[1]], lambda share: None)]
-        assert segmenter.label_set.names == {"left": 1, "right": 300}
+        assert {label.name: label.id for label in segmenter.label_set.labels} == {"left": 1, "right": 300}
     assert "cannot be read" in str(results[0])
     height, width = images[1].height, images[1].width
     assert results[1].dtype == np.int32
@@ -450,7 +450,7 @@ def test_arguments_are_quoted_as_in_a_shell():
 
 
 def test_a_name_after_a_colon_is_for_models_that_take_one():
-    with pytest.raises(OptionError, match="'sift:fine' is unknown; 'sift' has no models by name: leave ':fine' out"):
+    with pytest.raises(OptionError, match="--matcher 'sift:fine': 'sift' is one model; give --matcher sift"):
         create_matcher(MatchOptions(images=Path(), output=Path(), matcher="sift:fine"))
     with pytest.raises(OptionError, match="--matcher 'sfit:fine' is unknown; did you mean"):
         create_matcher(MatchOptions(images=Path(), output=Path(), matcher="sfit:fine"))

@@ -54,7 +54,7 @@ def test_a_broken_link_is_found(tmp_path):
 
 def test_every_page_is_in_the_navigation():
     named = re.findall(r"^\s+- .+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
-    assert sorted(named) == [page.relative_to(DOCS).as_posix() for page in PAGES]
+    assert sorted(named) == sorted(page.relative_to(DOCS).as_posix() for page in PAGES)
 
 
 @pytest.mark.skipif(find_spec("material") is None, reason="pip install '.[docs]' brings mkdocs-material")

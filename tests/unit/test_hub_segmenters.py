@@ -147,7 +147,7 @@ def test_features_change_with_the_part_of_the_image_that_changes(hub_model):
             "owner/no-such-model --local-dir FOLDER` elsewhere and give the folder in place of the id",
         ),
         ("labels:x", "--segmenter 'labels:x': 'labels' is one model; give --segmenter labels"),
-        ("cosg:x", "--segmenter 'cosg:x' is unknown; did you mean 'coseg'? known: ade20k, coseg, hf, labels"),
+        ("cosg:x", "--segmenter 'cosg:x' is unknown; did you mean 'coseg'? known: ade20k, coseg, external, hf, labels"),
     ],
 )
 def test_names_that_lead_to_no_model(name, expected):
