@@ -23,6 +23,7 @@ from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Crop, Matches
 from sgam_sfm.hub import load, load_network, transformers_for
 from sgam_sfm.machine import find_device, out_of_memory
+from sgam_sfm.matchers.frames import in_batches
 from sgam_sfm.matchers.masks import wanted
 
 HUB_ID = "zju-community/efficientloftr"
@@ -81,17 +82,7 @@ class EfficientLoFTR:
 
         Raises: OptionError when a pair does not fit into memory.
         """
-        results = [Matches.empty()] * len(pairs)
-        by_size: dict[tuple[int, ...], list[int]] = {}
-        for i, (crop0, crop1) in enumerate(pairs):
-            by_size.setdefault(frame_size(crop0) + frame_size(crop1), []).append(i)
-        for (width0, height0, width1, height1), same_size in by_size.items():
-            count = max(1, self.batch_pixels // (width0 * height0 + width1 * height1))
-            for start in range(0, len(same_size), count):
-                batch = same_size[start : start + count]
-                for i, matches in zip(batch, self._match([pairs[i] for i in batch]), strict=True):
-                    results[i] = matches
-        return results
+        return in_batches(pairs, frame_size, self.batch_pixels, self._match)
 
     def _match(self, pairs: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
         """The matches of pairs of equal frames, which go through the network together."""

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Crop, Matches
 from sgam_sfm.machine import find_device, out_of_memory
+from sgam_sfm.matchers.frames import in_batches
 from sgam_sfm.matchers.masks import wanted
 from sgam_sfm.matchers.state_dicts import fill
 from sgam_sfm.weights import LOFTR_INDOOR, LOFTR_OUTDOOR, find_weights
@@ -87,22 +88,12 @@ class LoFTR:
 
         Raises: OptionError when a pair does not fit into memory.
         """
-        results = [Matches.empty()] * len(pairs)
-        by_size: dict[tuple[int, ...], list[int]] = {}
-        for i, (crop0, crop1) in enumerate(pairs):
-            sizes = _padded(crop0) + _padded(crop1)
-            if min(sizes) > 2 * BORDER_CELLS * CELL:
-                by_size.setdefault(sizes, []).append(i)
-        for (width0, height0, width1, height1), same_size in by_size.items():
-            count = max(1, self.batch_pixels // (width0 * height0 + width1 * height1))
-            for start in range(0, len(same_size), count):
-                batch = same_size[start : start + count]
-                for i, matches in zip(batch, self._match([pairs[i] for i in batch]), strict=True):
-                    results[i] = matches
-        return results
+        return in_batches(pairs, _padded, self.batch_pixels, self._match)
 
     def _match(self, pairs: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
         """The matches of pairs of equal padded sizes, which go through the network together."""
+        if min(side for crop in pairs[0] for side in _padded(crop)) <= 2 * BORDER_CELLS * CELL:
+            return [Matches.empty()] * len(pairs)
         try:
             sides = (torch.from_numpy(_frames([pair[side] for pair in pairs])).to(self.device) for side in (0, 1))
             found = self._net(dict(zip(("image0", "image1"), sides, strict=True)))

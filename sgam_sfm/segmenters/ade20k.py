@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 from jaxtyping import Int32, UInt8
 
-from sgam_core.errors import SGAMError, WeightsError
-from sgam_sfm.images import ImageFile, read_image
+from sgam_core.errors import WeightsError
+from sgam_sfm.images import ImageFile
 from sgam_sfm.label_set import Label, LabelSet
+from sgam_sfm.segmenters.protocol import one_by_one
 from sgam_sfm.weights import ADE20K, find_weights
 
 CLASSES = (
@@ -52,13 +53,7 @@ class ADE20K31:
     def segment(
         self, images: Sequence[ImageFile], advance: Callable[[float], None]
     ) -> Iterator[tuple[ImageFile, Int32[np.ndarray, "H W"] | Exception]]:
-        for image in images:
-            try:
-                labels: Int32[np.ndarray, "H W"] | Exception = self._labels(read_image(image))
-            except SGAMError as error:
-                labels = error
-            advance(1.0)
-            yield image, labels
+        return one_by_one(self._labels, images, advance)
 
     def _labels(self, pixels: UInt8[np.ndarray, "H W 3"]) -> Int32[np.ndarray, "h w"]:
         """The map at the network's resolution; the image keeps its aspect, beside it the square is black."""

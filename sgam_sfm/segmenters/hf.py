@@ -15,12 +15,13 @@ from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from sgam_core.errors import OptionError, SGAMError
+from sgam_core.errors import OptionError
 from sgam_core.semantic import LABEL_WIDTH
 from sgam_sfm.hub import load, load_network, transformers_for
-from sgam_sfm.images import ImageFile, read_image
+from sgam_sfm.images import ImageFile
 from sgam_sfm.label_set import Label, LabelSet
 from sgam_sfm.machine import find_device
+from sgam_sfm.segmenters.protocol import one_by_one
 
 _PLANES = 16  # classes that are enlarged together: maps of many classes stay small in memory
 _MASK_OUTPUTS = (("class_queries_logits", "masks_queries_logits"), ("logits", "pred_masks"))
@@ -55,13 +56,7 @@ class HubSegmenter:
     def segment(
         self, images: Sequence[ImageFile], advance: Callable[[float], None]
     ) -> Iterator[tuple[ImageFile, Int32[np.ndarray, "H W"] | Exception]]:
-        for image in images:
-            try:
-                labels: Int32[np.ndarray, "H W"] | Exception = self._labels(read_image(image))
-            except SGAMError as error:
-                labels = error
-            advance(1.0)
-            yield image, labels
+        return one_by_one(self._labels, images, advance)
 
     @torch.inference_mode()
     def _labels(self, pixels: UInt8[np.ndarray, "H W 3"]) -> Int32[np.ndarray, "h w"]:

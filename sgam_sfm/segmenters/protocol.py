@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int32
+from jaxtyping import Int32, UInt8
 
-from sgam_sfm.images import ImageFile
+from sgam_core.errors import SGAMError
+from sgam_sfm.images import ImageFile, read_image
 
 
 @runtime_checkable
@@ -24,3 +25,18 @@ class Segmenter(Protocol):
         shares add up to len(images).
         """
         ...
+
+
+def one_by_one(
+    labels_of: Callable[[UInt8[np.ndarray, "H W 3"]], Int32[np.ndarray, "h w"]],
+    images: Sequence[ImageFile],
+    advance: Callable[[float], None],
+) -> Iterator[tuple[ImageFile, Int32[np.ndarray, "H W"] | Exception]]:
+    """`Segmenter.segment` of a network that looks at one image at a time, given its pixels (RGB)."""
+    for image in images:
+        try:
+            labels: Int32[np.ndarray, "H W"] | Exception = labels_of(read_image(image))
+        except SGAMError as error:
+            labels = error
+        advance(1.0)
+        yield image, labels
