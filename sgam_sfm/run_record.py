@@ -18,7 +18,7 @@ from typing import Literal
 from filelock import FileLock, Timeout
 
 from sgam_core.errors import InputError, SGAMError
-from sgam_sfm import supervision
+from sgam_sfm import supervised
 from sgam_sfm.files import remove_partials, write_json
 from sgam_sfm.progress import StageProgress, Stages
 
@@ -75,7 +75,7 @@ def recording(output: Path, stages: Stages) -> Iterator[RunRecord | None]:
             f"another run is working in '{output}'{who}; wait for it, stop it, or choose another --output"
         ) from error
     remove_partials(output)
-    for crash in supervision.crashes()[-1:]:
+    for crash in supervised.crashes()[-1:]:
         where = " - ".join(crash.pair) or crash.stage or "its start"
         _log.info("the process before this one was %s at %s", crash.told, where)
     before = _read(path)
@@ -117,13 +117,13 @@ class _Heart:
             host=socket.gethostname(),
             started=now,
             updated=now,
-            crashes=len(supervision.crashes()),
+            crashes=len(supervised.crashes()),
         )
         self._written = 0.0
         self._writing = threading.Lock()
 
     def listen(self, progress: StageProgress) -> None:
-        supervision.tell(progress.stage, progress.done, progress.pair)
+        supervised.tell(progress.stage, progress.done, progress.pair)
         changed = progress.stage != self.record.stage
         self.record = replace(self.record, **asdict(progress), eta_seconds=progress.eta_seconds)
         if changed or time.monotonic() - self._written > _SECONDS_BETWEEN_WRITES:

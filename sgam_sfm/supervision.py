@@ -23,12 +23,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from types import FrameType
-from typing import IO, Any
+from typing import Any
 
 from sgam_sfm.child import end_with_parent
 from sgam_sfm.exit_codes import ERROR, INTERRUPTED
+from sgam_sfm.supervised import TRIES, Crash, begin
 
-_TRIES = 2
 _SECONDS_OF_ONE_STOP = 1.0
 _COMMANDS = ("match",)
 _PROGRAM = "import sys; from sgam_sfm.supervision import child; sys.exit(child(int(sys.argv[1])))"
@@ -38,73 +38,15 @@ _CRASHES = tuple(
 )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Crash:
-    """A process of this run that was ended from outside: by which signal, and what it was working on then.
-
-    done: steps of the stage. pair: empty when it was between pairs, or in a stage without them.
-    """
-
-    signal: str
-    stage: str = ""
-    done: float = 0.0
-    pair: tuple[str, ...] = ()
-
-    @property
-    def told(self) -> str:
-        """In words."""
-        hint = " (out of memory?)" if self.signal == "SIGKILL" else ""
-        return f"ended by {self.signal}{hint}"
-
-    def same_place(self, other: Crash) -> bool:
-        """Whether nothing was done between the two ends."""
-        return (self.stage, self.done, self.pair) == (other.stage, other.done, other.pair)
-
-
-# In the child.
-
-
-@dataclass
-class _Supervised:
-    crashes: tuple[Crash, ...] = ()
-    to_parent: IO[str] | None = None
-
-
-_state = _Supervised()
-
-
 class Terminated(KeyboardInterrupt):
     """Ctrl-C, or the signal that schedulers stop a job with; both are a clean stop."""
-
-
-def crashes() -> tuple[Crash, ...]:
-    """How the processes before this one were ended, of the same run."""
-    return _state.crashes
-
-
-def given_up(pair: Sequence[str]) -> str:
-    """Why a pair is not to be tried again, empty when it is."""
-    ends = [crash for crash in _state.crashes if crash.pair == tuple(pair)]
-    if len(ends) < _TRIES:
-        return ""
-    what = f"the process was {ends[-1].told} while it matched this pair, {len(ends)} times"
-    return f"{what}; lower --image-size and --area-size, or take another --matcher"
-
-
-def tell(stage: str, done: float, pair: Sequence[str]) -> None:
-    """Tell the supervisor, if there is one, what is worked on from now on."""
-    if _state.to_parent is not None:
-        with suppress(OSError):  # the supervisor is gone, and this process soon
-            _state.to_parent.write(json.dumps({"stage": stage, "done": done, "pair": list(pair)}) + "\n")
-            _state.to_parent.flush()
 
 
 def child(pipe: int) -> int:
     """The child process: a job from standard input, then the command line. Returns: its exit code."""
     job = json.loads(sys.stdin.buffer.readline())
     end_with_parent(sys.stdin.fileno())
-    _state.crashes = tuple(map(_crash, job["crashes"]))
-    _state.to_parent = os.fdopen(pipe, "w", encoding="utf-8")
+    begin(job["crashes"], pipe)
     _stop_cleanly()
     try:
         from sgam_sfm.cli import run
@@ -113,10 +55,6 @@ def child(pipe: int) -> int:
     except KeyboardInterrupt:  # before the command line could say so
         _say("stopped; the same command continues where it was")
         return INTERRUPTED
-
-
-def _crash(told: dict[str, Any]) -> Crash:
-    return Crash(**(told | {"pair": tuple(told["pair"])}))
 
 
 def _stop_cleanly() -> None:
@@ -157,12 +95,12 @@ def supervise(arguments: Sequence[str]) -> int:
                 return INTERRUPTED
             if -code not in _CRASHES:
                 return code if code >= 0 else 128 - code
-            crash = _crash({"signal": signal.Signals(-code).name, "pair": ()} | place)
+            crash = Crash.of({"signal": signal.Signals(-code).name, "pair": ()} | place)
             where = " - ".join(crash.pair) or f"stage '{crash.stage}'" if crash.stage else "its start"
             ends.append(crash)
-            if not crash.pair and sum(map(crash.same_place, ends)) >= _TRIES:
+            if not crash.pair and sum(map(crash.same_place, ends)) >= TRIES:
                 _say(
-                    f"error: the process was {crash.told} at {where}, {_TRIES} times; what was matched has been kept, "
+                    f"error: the process was {crash.told} at {where}, {TRIES} times; what was matched has been kept, "
                     "and the same command continues"
                 )
                 return ERROR

@@ -14,7 +14,7 @@ from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
 from sgam_sfm.progress import Advance
 from sgam_sfm.store import PairRecord
-from sgam_sfm.supervision import given_up
+from sgam_sfm.supervised import given_up
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -8,27 +8,27 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 
 import psutil
 import pytest
 
 from sgam_sfm import supervision
 from sgam_sfm.exit_codes import ERROR, INTERRUPTED
-from sgam_sfm.supervision import Crash, supervise
+from sgam_sfm.supervised import Crash
+from sgam_sfm.supervision import supervise
 
 CHILD = """
 import json, os, signal, sys, time
-from sgam_sfm import supervision
-job = json.loads(sys.stdin.buffer.readline())
-supervision._state.crashes = tuple(map(supervision._crash, job["crashes"]))
-supervision._state.to_parent = os.fdopen(int(sys.argv[1]), "w")
+from sgam_sfm import supervised
+supervised.begin(json.loads(sys.stdin.buffer.readline())["crashes"], int(sys.argv[1]))
 """
 TWO_PAIRS = """
 for done, pair in enumerate([("a", "b"), ("a", "c")]):
-    supervision.tell("Matching pairs", done, pair)
-    if not supervision.given_up(pair) and "b" in pair:
+    supervised.tell("Matching pairs", done, pair)
+    if not supervised.given_up(pair) and "b" in pair:
         os.kill(os.getpid(), signal.SIGKILL)
-print(len(supervision.crashes()), supervision.given_up(("a", "b")), supervision.given_up(("a", "c")))
+print(len(supervised.crashes()), supervised.given_up(("a", "b")), supervised.given_up(("a", "c")))
 sys.exit(3)
 """
 
@@ -55,7 +55,7 @@ def test_a_pair_that_ends_the_process_is_tried_twice_and_the_run_goes_on(child, 
 
 
 def test_a_stage_that_ends_the_process_twice_is_the_end(child, capfd):
-    child('supervision.tell("Merging keypoints", 0.0, ()); os.kill(os.getpid(), signal.SIGSEGV)')
+    child('supervised.tell("Merging keypoints", 0.0, ()); os.kill(os.getpid(), signal.SIGSEGV)')
     assert supervise(["match"]) == ERROR
     assert capfd.readouterr().err.splitlines()[-1] == (
         "error: the process was ended by SIGSEGV at stage 'Merging keypoints', 2 times; what was matched has been "
@@ -160,4 +160,4 @@ def test_help_and_other_commands_are_not_supervised(monkeypatch, capsys):
 
 def test_what_a_crash_is_travels_as_json():
     crash = Crash(signal="SIGBUS", stage="Matching pairs", done=3.0, pair=("a", "b"))
-    assert supervision._crash(json.loads(json.dumps(supervision.asdict(crash)))) == crash
+    assert Crash.of(json.loads(json.dumps(asdict(crash)))) == crash
