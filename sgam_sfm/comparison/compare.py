@@ -23,7 +23,7 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import create_segmenter, write_label_maps
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import find_device
-from sgam_sfm.matching import create_area_matcher
+from sgam_sfm.matching import create_area_matcher, create_matcher
 from sgam_sfm.options import MatchOptions, fingerprint
 from sgam_sfm.pairs import spread_over, write_pairs
 from sgam_sfm.progress import Stages
@@ -43,6 +43,8 @@ def compare(options: CompareOptions, console: Console) -> dict[str, Any]:
     methods, cut = parse_methods(options.methods), parse_cut(options.hard, options.scene_scale)
     common = MatchOptions(**{field.name: getattr(options, field.name) for field in fields(MatchOptions)})
     common = replace(common, device=str(find_device(options.device, "--device")))
+    for matcher in sorted({method.matcher for method in methods if method.matcher}):
+        create_matcher(replace(common, matcher=matcher))  # what one lacks is said now, not after hours
     stages = Stages(console=console)
     inputs = read_inputs(replace(common, output=options.output / "inputs"), stages)
     if str(cut):

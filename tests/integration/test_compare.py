@@ -120,6 +120,14 @@ def test_wrong_methods_are_told_before_anything_runs(folder, tmp_path, capsys):
     assert not (tmp_path / "out" / "labels").exists()
 
 
+def test_missing_weights_are_told_before_anything_runs(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub"))
+    command = ["compare", *common(folder, tmp_path / "out"), "--methods", "none:sift", "none:loftr"]
+    assert cli.run(command) == ERROR
+    assert "run `sgam-sfm models get loftr`" in capsys.readouterr().err.replace("\n", " ")
+    assert not (tmp_path / "out" / "none_sift").exists()
+
+
 def test_evaluate_judges_matches_poses_and_areas(folder, tmp_path):
     output = tmp_path / "out"
     assert cli.run(["evaluate", *common(folder, output), "--ablation", "--max-pairs", "3"]) == DONE
