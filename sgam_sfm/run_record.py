@@ -23,6 +23,7 @@ from sgam_sfm.files import remove_partials, write_json
 from sgam_sfm.progress import StageProgress, Stages
 
 _SECONDS_BETWEEN_WRITES = 1.0
+_SECONDS_OF_AN_ENDING = 5.0  # a killed run's child ends a moment after it
 SECONDS_BETWEEN_BEATS = 10.0
 _log = logging.getLogger(__name__)
 
@@ -65,7 +66,7 @@ def recording(output: Path, stages: Stages) -> Iterator[RunRecord | None]:
     """
     output.mkdir(parents=True, exist_ok=True)
     path = output / "progress.json"
-    lock = FileLock(_lock_path(output), timeout=0)
+    lock = FileLock(_lock_path(output), timeout=_SECONDS_OF_AN_ENDING)
     try:
         lock.acquire()
     except Timeout as error:
