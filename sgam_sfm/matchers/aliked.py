@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -14,7 +15,7 @@ from sgam_core.types import Crop
 from sgam_sfm.matchers.frames import ready, rgb_frames
 from sgam_sfm.matchers.lightglue import with_lightglue
 from sgam_sfm.matchers.peaks import parabola, peaks
-from sgam_sfm.matchers.sparse import MIN_SIDE, Features, SparseMatcher, checked_count
+from sgam_sfm.matchers.sparse import MIN_SIDE, Features, checked_count
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
 from sgam_sfm.weights import ALIKED, ALIKED_LIGHTGLUE
 
@@ -50,32 +51,5 @@ class ALIKEDExtractor:
         return Features.of(points + 0.5, descriptors, crop)
 
 
-def aliked_lightglue(
-    *,
-    weights: Path | None = None,
-    device: str = "cpu",
-    seed: int = 0,
-    max_features: int = 2048,
-    min_score: float = 0.1,
-    photometric: bool = True,
-    batch: int = 0,
-) -> SparseMatcher:
-    """ALIKED (n16) with LightGlue.
-
-    Args: weights: a folder with both files under their own names; found by itself when omitted. device: a torch device.
-        seed: accepted as by every matcher, but nothing here is random. max_features: of a crop, by score. min_score:
-        matches exceed it. photometric: align the patches of the matches in the end, on the CPU. batch: crops, or pairs,
-        that go through a network together; 0: 1 on the CPU, 8 elsewhere.
-    Raises: WeightsError when there are no weights or they are not those of the models; OptionError for wrong options.
-    """
-    return with_lightglue(
-        ALIKEDExtractor,
-        (ALIKED, ALIKED_LIGHTGLUE),
-        weights=weights,
-        device=device,
-        max_features=max_features,
-        min_score=min_score,
-        photometric=photometric,
-        batch=batch,
-        input_dim=CHANNELS,
-    )
+aliked_lightglue = partial(with_lightglue, ALIKEDExtractor, (ALIKED, ALIKED_LIGHTGLUE), input_dim=CHANNELS)
+"""ALIKED (n16) with LightGlue; arguments and errors: see `with_lightglue`."""

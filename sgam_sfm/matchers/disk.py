@@ -8,6 +8,7 @@ images would show: where the patches of a match look alike, they decide.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -19,7 +20,7 @@ from sgam_core.types import Crop
 from sgam_sfm.matchers.frames import ready, rgb_frames
 from sgam_sfm.matchers.lightglue import with_lightglue
 from sgam_sfm.matchers.peaks import parabola, peaks
-from sgam_sfm.matchers.sparse import MIN_SIDE, Features, SparseMatcher, checked_count
+from sgam_sfm.matchers.sparse import MIN_SIDE, Features, checked_count
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
 from sgam_sfm.weights import DISK, DISK_LIGHTGLUE
 
@@ -53,28 +54,5 @@ class DISKExtractor:
         return found
 
 
-def disk_lightglue(
-    *,
-    weights: Path | None = None,
-    device: str = "cpu",
-    seed: int = 0,
-    max_features: int = 2048,
-    min_score: float = 0.1,
-    photometric: bool = True,
-    batch: int = 0,
-) -> SparseMatcher:
-    """DISK (depth) with LightGlue.
-
-    Args and errors: as `aliked_lightglue`.
-    """
-    return with_lightglue(
-        DISKExtractor,
-        (DISK, DISK_LIGHTGLUE),
-        weights=weights,
-        device=device,
-        max_features=max_features,
-        min_score=min_score,
-        photometric=photometric,
-        batch=batch,
-        input_dim=CHANNELS,
-    )
+disk_lightglue = partial(with_lightglue, DISKExtractor, (DISK, DISK_LIGHTGLUE), input_dim=CHANNELS)
+"""DISK (depth) with LightGlue; arguments and errors: see `with_lightglue`."""

@@ -82,18 +82,23 @@ def with_lightglue(
     extractor: Callable[[Path, int, torch.device], Extract],
     specs: tuple[WeightsSpec, WeightsSpec],
     *,
-    weights: Path | None,
-    device: str,
-    max_features: int,
-    min_score: float,
-    photometric: bool,
-    batch: int,
+    weights: Path | None = None,
+    device: str = "cpu",
+    seed: int = 0,
+    max_features: int = 2048,
+    min_score: float = 0.1,
+    photometric: bool = True,
+    batch: int = 0,
     **config: Any,
 ) -> SparseMatcher:
     """A sparse matcher of an extractor, made of (file, max_features, device), and LightGlue.
 
-    Args: specs: the weights of the extractor and of LightGlue. config: of `LightGlueAssignment`. The others are those
-        of every such matcher, see `aliked_lightglue`.
+    Args: specs: the weights of the extractor and of LightGlue. weights: a folder with both files under their own names;
+        found by itself when omitted. device: a torch device. seed: accepted as by every matcher, but nothing here is
+        random. max_features: of a crop, by score. min_score: matches exceed it. photometric: align the patches of the
+        matches in the end, on the CPU. batch: crops, or pairs, that go through a network together; 0: 1 on the CPU, 8
+        elsewhere. config: of `LightGlueAssignment`.
+    Raises: WeightsError when there are no weights or they are not those of the models; OptionError for wrong options.
     """
     place, files = find_device(device), find_all_weights(specs, weights)
     together = batch_size(place, batch)

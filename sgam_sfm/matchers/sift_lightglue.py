@@ -22,7 +22,7 @@ def sift_lightglue(
 ) -> SparseMatcher:
     """SIFT with LightGlue.
 
-    Args: weights: LightGlue's file; found by itself when omitted. Others, and errors: as `aliked_lightglue`.
+    Args: weights: LightGlue's file; found by itself when omitted. Others, and errors: as `with_lightglue`.
     """
     place, together = find_device(device), batch_size(find_device(device), batch)
     assign = LightGlueAssignment(

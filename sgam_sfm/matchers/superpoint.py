@@ -7,6 +7,7 @@ out of cells as XFeat's are, and are placed below the pixel in the same two ways
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -18,7 +19,7 @@ from sgam_core.types import Crop
 from sgam_sfm.matchers.frames import ready, rgb_frames
 from sgam_sfm.matchers.lightglue import with_lightglue
 from sgam_sfm.matchers.peaks import parabola, peaks
-from sgam_sfm.matchers.sparse import MIN_SIDE, Features, SparseMatcher, checked_count
+from sgam_sfm.matchers.sparse import MIN_SIDE, Features, checked_count
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
 from sgam_sfm.weights import SUPERPOINT, SUPERPOINT_LIGHTGLUE
 
@@ -86,28 +87,7 @@ class SuperPointExtractor:
         return Features.of(points, normalize(descriptors, dim=1), crop)
 
 
-def superpoint_lightglue(
-    *,
-    weights: Path | None = None,
-    device: str = "cpu",
-    seed: int = 0,
-    max_features: int = 2048,
-    min_score: float = 0.1,
-    photometric: bool = True,
-    batch: int = 0,
-) -> SparseMatcher:
-    """SuperPoint with LightGlue.
-
-    Args and errors: as `aliked_lightglue`.
-    """
-    return with_lightglue(
-        SuperPointExtractor,
-        (SUPERPOINT, SUPERPOINT_LIGHTGLUE),
-        weights=weights,
-        device=device,
-        max_features=max_features,
-        min_score=min_score,
-        photometric=photometric,
-        batch=batch,
-        input_dim=CHANNELS,
-    )
+superpoint_lightglue = partial(
+    with_lightglue, SuperPointExtractor, (SUPERPOINT, SUPERPOINT_LIGHTGLUE), input_dim=CHANNELS
+)
+"""SuperPoint with LightGlue; arguments and errors: see `with_lightglue`."""

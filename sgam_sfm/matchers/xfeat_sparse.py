@@ -7,7 +7,9 @@ where the patches of a match look alike, they decide the rest: the keypoints alo
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -19,13 +21,19 @@ from sgam_core.types import Crop
 from sgam_sfm.matchers.frames import rgb_frames
 from sgam_sfm.matchers.lightglue import with_lightglue
 from sgam_sfm.matchers.peaks import parabola, peaks
-from sgam_sfm.matchers.sparse import MIN_SIDE, Features, SparseMatcher, checked_count
+from sgam_sfm.matchers.sparse import MIN_SIDE, Features, checked_count
 from sgam_sfm.matchers.xfeat import CELL, MULTIPLE, load_xfeat
 from sgam_sfm.weights import LIGHTERGLUE, XFEAT
 
 CHANNELS = 64
 MIN_PROBABILITY = 0.05  # of a keypoint within its cell, as published
-CONFIG = {"input_dim": CHANNELS, "descriptor_dim": 96, "n_layers": 6, "num_heads": 1, "depth_confidence": -1}
+CONFIG: dict[str, Any] = {
+    "input_dim": CHANNELS,
+    "descriptor_dim": 96,
+    "n_layers": 6,
+    "num_heads": 1,
+    "depth_confidence": -1,
+}
 
 
 class XFeatExtractor:
@@ -64,28 +72,5 @@ class XFeatExtractor:
         return Features.of(points, normalize(descriptors, dim=1), crop)
 
 
-def xfeat_lighterglue(
-    *,
-    weights: Path | None = None,
-    device: str = "cpu",
-    seed: int = 0,
-    max_features: int = 4096,
-    min_score: float = 0.1,
-    photometric: bool = True,
-    batch: int = 0,
-) -> SparseMatcher:
-    """XFeat's sparse keypoints with LighterGlue, a small LightGlue.
-
-    Args and errors: as `aliked_lightglue`.
-    """
-    return with_lightglue(
-        XFeatExtractor,
-        (XFEAT, LIGHTERGLUE),
-        weights=weights,
-        device=device,
-        max_features=max_features,
-        min_score=min_score,
-        photometric=photometric,
-        batch=batch,
-        **CONFIG,
-    )
+xfeat_lighterglue = partial(with_lightglue, XFeatExtractor, (XFEAT, LIGHTERGLUE), max_features=4096, **CONFIG)
+"""XFeat's sparse keypoints with LighterGlue, a small LightGlue; arguments and errors: see `with_lightglue`."""
