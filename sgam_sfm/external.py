@@ -257,6 +257,7 @@ class _Process:
             raise
         finally:
             timer.cancel()
+            timer.join()  # it holds on to this process until it ends
 
     def told(self) -> str:
         """The last lines that the process printed, for the end of a message; it is ended."""
