@@ -32,6 +32,7 @@ from sgam_sfm.child import end_with_parent
 from sgam_sfm.files import flush
 from sgam_sfm.machine import peak_memory_mb
 from sgam_sfm.pairs import Pair
+from sgam_sfm.refinement import refine
 from sgam_sfm.triangulation import require_fitting, triangulated
 
 Progress = Callable[[str, int, int], None]
@@ -434,6 +435,9 @@ def _map(job: dict[str, Any], send: Send) -> dict[str, Any]:
     )
     if options.mapper == "triangulate" and not models[0].num_points3D():
         models, reason = [], f"COLMAP triangulated no point with the known poses from {len(verified)} verified pairs"
+    if options.mapper != "triangulate":
+        for model in models:
+            refine(model, _incremental_options(options, fixed))
     order = sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     summaries = []
     for number, model in enumerate(order):
