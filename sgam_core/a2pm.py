@@ -16,7 +16,7 @@ from sgam_core.covisible import Frame
 from sgam_core.crops import area_crop, box_crop, whole_crop
 from sgam_core.geometry import estimate_two_view, residuals
 from sgam_core.guidance import guided_areas
-from sgam_core.options import CropOptions, SGAMOptions
+from sgam_core.options import CropOptions, GuidanceOptions, SGAMOptions
 from sgam_core.prediction import Estimate, MatchedArea, predict
 from sgam_core.protocols import AreaMatcher, PointMatcher
 from sgam_core.rejection import reject
@@ -67,8 +67,8 @@ def match_described(
 ) -> PairResult:
     """The whole algorithm for two images whose areas have been described: SAM, PM, GP, GR, GMC, and guided areas.
 
-    Guided areas follow where the area matcher has an attribute `guides` that is true. Crops are those of `area_crop`,
-    unless it has a method `crop(image, box, options)` of its own.
+    Where the area matcher has an attribute `guides` that is true, photos taken sideways are turned first, and guided
+    areas follow. Crops are those of `area_crop`, unless it has a method `crop(image, box, options)` of its own.
     """
     points = _Points(image0, image1, point_matcher, options.crop, getattr(area_matcher, "crop", area_crop))
     estimate = partial(
@@ -76,7 +76,10 @@ def match_described(
     )
     clock = _Clock(points)
 
-    guides = options.guidance.enabled and getattr(area_matcher, "guides", False)
+    guides = getattr(area_matcher, "guides", False)
+    if guides and options.turning.enabled:
+        points.turns = _turns(points, estimate, options)
+    guides = guides and options.guidance.enabled
     first = _plain(points, estimate, options) if guides else None
     clock.lap("whole images")
     if first is None:
@@ -96,6 +99,7 @@ def match_described(
         whole_scale1=whole_crop(image1, options.crop).scale,
         fallback=found.fallback,
         notes=found.notes + points.notes,
+        turns=points.turns,
         pixels_matched=points.pixels,
         seconds=clock.seconds,
     )
@@ -114,13 +118,27 @@ class _Found:
 
 def _plain(points: _Points, estimate: Estimate, options: SGAMOptions) -> _Found | None:
     """The whole images, where they agree so well that areas have nothing to add but resolution."""
-    whole, guidance = points.whole(), options.guidance
-    model = estimate(whole)
-    if model is None or not guidance.sure_matches or model.num_inliers < guidance.sure_matches:
+    if not _agree(model := points.agreement(estimate), options.guidance):
         return None
-    if model.inlier_ratio < guidance.sure_inlier_ratio:
-        return None
-    return _Found(matches=whole, model=model, fallback="whole images agree, and crops would be no finer")
+    return _Found(matches=points.whole(), model=model, fallback="whole images agree, and crops would be no finer")
+
+
+def _agree(model: TwoViewModel | None, options: GuidanceOptions) -> bool:
+    """Whether whole images agree so well that nothing else need be tried; never without `sure_matches`."""
+    if model is None or not options.sure_matches:
+        return False
+    return model.num_inliers >= options.sure_matches and model.inlier_ratio >= options.sure_inlier_ratio
+
+
+def _turns(points: _Points, estimate: Estimate, options: SGAMOptions) -> int:
+    """The quarter turns of image 1 by which small whole images agree clearly better than as they are; 0 for none."""
+    if _agree(points.agreement(estimate), options.guidance):
+        return 0
+    models = [estimate(matches) for matches in points.at_every_turn(options.turning.image_size)]
+    inliers = [0 if model is None else model.num_inliers for model in models]
+    best = int(np.argmax(inliers))
+    enough = max(options.turning.min_inliers, options.turning.min_lead * inliers[0])
+    return best if inliers[best] >= enough else 0
 
 
 def _by_areas(
@@ -140,9 +158,8 @@ def _by_areas(
     final = tuple(_final(area, verdict.fallback) for area in verdict.areas)
     if verdict.fallback:
         whole = points.whole()
-        found = _Found(
-            matches=whole, model=estimate(whole), areas=final, fallback=verdict.fallback, notes=putative.notes
-        )
+        model = points.agreement(estimate)
+        found = _Found(matches=whole, model=model, areas=final, fallback=verdict.fallback, notes=putative.notes)
     else:
         matches = _collected(final, verdict.model, points.whole, points, options)
         found = _Found(matches=matches, model=verdict.model, areas=final, notes=putative.notes)
@@ -240,7 +257,19 @@ class _Points:
         self.pixels = self.pixels_of_areas = 0
         self.seconds = 0.0
         self.notes: tuple[str, ...] = ()
+        self._turns = 0
         self._whole: Matches | None = None
+        self._agreement: TwoViewModel | None = None
+
+    @property
+    def turns(self) -> int:
+        """Quarter turns anticlockwise by which the matcher sees image 1."""
+        return self._turns
+
+    @turns.setter
+    def turns(self, turns: int) -> None:
+        if turns != self._turns:
+            self._turns, self._whole, self._agreement = turns, None, None
 
     @property
     def whole_is_known(self) -> bool:
@@ -249,9 +278,24 @@ class _Points:
     def whole(self) -> Matches:
         """Plain matches of the whole images, computed at the first call."""
         if self._whole is None:
-            crop0, crop1 = (whole_crop(image, self.options) for image in self.images)
-            self._whole = self._match([(crop0, crop1)])[0]
+            self._whole = self._match([self._whole_crops(self.options.image_size)])[0]
         return self._whole
+
+    def agreement(self, estimate: Estimate) -> TwoViewModel | None:
+        """The geometry of the whole images, computed at the first call."""
+        if self._agreement is None:
+            self._agreement = estimate(self.whole())
+        return self._agreement
+
+    def at_every_turn(self, image_size: int) -> list[Matches]:
+        """Plain matches of the whole images at another size, image 1 turned by 0, 1, 2 and 3 quarters."""
+        crop0, crop1 = self._whole_crops(image_size)
+        return self._match([(crop0, crop1.turned(turns)) for turns in range(4)])
+
+    def _whole_crops(self, image_size: int) -> tuple[Crop, Crop]:
+        options = replace(self.options, image_size=image_size)
+        crop0, crop1 = (whole_crop(image, options) for image in self.images)
+        return crop0, crop1
 
     def inside(self, putative: PutativeAreas, max_candidates: int) -> tuple[list[MatchedArea], list[list[MatchedArea]]]:
         """Point matches inside all confident areas and the doubtful candidates that the limits allow."""
@@ -307,6 +351,7 @@ class _Points:
         """Run the point matcher and bring its points to image pixels."""
         if not crops:
             return []
+        crops = [(crop0, crop1.turned(self._turns)) for crop0, crop1 in crops]
         self.pixels += sum(crop.size[0] * crop.size[1] for pair in crops for crop in pair)
         start = time.perf_counter()
         matched = self.matcher.match(crops)

@@ -262,6 +262,20 @@ class GuidanceOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class TurningOptions(_Checked):
+    """Quarter turns: photos taken upright and sideways (not in the paper)."""
+
+    enabled: bool = True
+    """Where whole images do not agree, look whether they do once the second one is turned by 90, 180 or 270 degrees."""
+    image_size: int = 512
+    """Long side of a whole image at the matcher for this look, pixels."""
+    min_inliers: int = 25
+    """Fewest consistent matches for a turn."""
+    min_lead: float = 2.0
+    """And at least so many times those that the images have as they are."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class SGAMOptions(_Checked):
     """All stages of the algorithm."""
 
@@ -273,6 +287,8 @@ class SGAMOptions(_Checked):
     """The area matcher `tiles`."""
     covisible: CovisibleOptions = field(default_factory=CovisibleOptions)
     """The area matcher `covisible`."""
+    turning: TurningOptions = field(default_factory=TurningOptions)
+    """Quarter turns."""
     geometry: GeometryOptions = field(default_factory=GeometryOptions)
     """Robust estimation."""
     prediction: PredictionOptions = field(default_factory=PredictionOptions)
@@ -307,6 +323,7 @@ PAPER = changed(
     collection__rule="paper",
     collection__min_coverage=0.3,
     guidance__enabled=False,
+    turning__enabled=False,
 )
 """The paper's own parameters (its appendix), with GR in the form that can accept an area."""
 

@@ -97,47 +97,72 @@ class Image:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Crop:
-    """A window of an image, resized for a point matcher.
+    """A window of an image, resized and turned for a point matcher.
 
-    window: whole pixels inside the image. size: (width, height) in the matcher's pixels. The resize is isotropic up to
-    the rounding of `size`; `crop_from_image` is the exact affine map of what `pixels` returns.
+    window: whole pixels inside the image. size: (width, height) in the matcher's pixels, as it sees them. turns:
+    quarter turns anticlockwise, 0 to 3. The resize is isotropic up to the rounding of `size`; `crop_from_image` is the
+    exact affine map of what `pixels` returns.
     """
 
     image: Image
     window: Box
     size: tuple[int, int]
+    turns: int = 0
 
     @property
-    def key(self) -> tuple[str, float, float, float, float, int, int]:
+    def key(self) -> tuple[str, float, float, float, float, int, int, int]:
         """Equal for crops with equal content: what a matcher may cache features by, within one collection."""
-        return (self.image.name, self.window.x0, self.window.y0, self.window.x1, self.window.y1, *self.size)
+        w = self.window
+        return (self.image.name, w.x0, w.y0, w.x1, w.y1, *self.size, self.turns)
 
     @property
     def scale(self) -> float:
         """Matcher pixels per image pixel."""
-        return min(self.size[0] / self.window.width, self.size[1] / self.window.height)
+        width, height = self._size_before_turns
+        return min(width / self.window.width, height / self.window.height)
 
     @property
     def crop_from_image(self) -> Float[np.ndarray, "2 3"]:
-        """Affine map (2, 3) from image to crop pixels: s * (p - origin)."""
-        sx, sy = self.size[0] / self.window.width, self.size[1] / self.window.height
-        return np.array([[sx, 0.0, -sx * self.window.x0], [0.0, sy, -sy * self.window.y0]])
+        """Affine map (2, 3) from image to crop pixels: s * (p - origin), then the quarter turns."""
+        width, height = self._size_before_turns
+        sx, sy = width / self.window.width, height / self.window.height
+        affine = np.array([[sx, 0.0, -sx * self.window.x0], [0.0, sy, -sy * self.window.y0]])
+        for _ in range(self.turns):  # (x, y) becomes (y, width - x)
+            affine = np.array([affine[1], [0.0, 0.0, width] - affine[0]])
+            width, height = height, width
+        return affine
+
+    def turned(self, turns: int) -> Crop:
+        """The same crop turned by so many more quarter turns anticlockwise."""
+        size = self.size[::-1] if turns % 2 else self.size
+        return replace(self, size=size, turns=(self.turns + turns) % 4)
 
     def to_image(self, points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
         """Crop pixels (N, 2) to image pixels."""
         affine = self.crop_from_image
-        image_points: np.ndarray = (points - affine[:, 2]) / affine[[0, 1], [0, 1]]
+        moved = points - affine[:, 2]
+        if self.turns % 2:
+            return np.stack([moved[:, 1] / affine[1, 0], moved[:, 0] / affine[0, 1]], axis=1)
+        image_points: np.ndarray = moved / affine[[0, 1], [0, 1]]
         return image_points
 
     def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
         """The crop's own pixels (h, w, 3) RGB."""
-        return _resize(self._cut(self.image.pixels), self.size, smooth=True)
+        return self._turn(_resize(self._cut(self.image.pixels), self._size_before_turns, smooth=True))
 
     def mask(self) -> Bool[np.ndarray, "h w"] | None:
         """The crop's mask (h, w), True where matches are wanted; None when the image has none."""
         if self.image.mask is None:
             return None
-        return _resize(self._cut(self.image.mask).astype(np.uint8), self.size, smooth=False).astype(bool)
+        mask = _resize(self._cut(self.image.mask).astype(np.uint8), self._size_before_turns, smooth=False)
+        return self._turn(mask.astype(bool))
+
+    @property
+    def _size_before_turns(self) -> tuple[int, int]:
+        return self.size[::-1] if self.turns % 2 else self.size
+
+    def _turn(self, array: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.rot90(array, self.turns))
 
     def _cut(self, array: np.ndarray) -> np.ndarray:
         w = self.window
@@ -299,7 +324,8 @@ class PairResult:
     geometry, None when there is none. coverage0, coverage1: share of each image inside kept areas. whole_scale0,
     whole_scale1: matcher pixels per image pixel of plain whole-image matching at the same options. fallback: why the
     whole images were matched instead of areas, empty when areas were used. notes: limits that were reached.
-    pixels_matched: sum over both sides of every point-matcher call. seconds: by stage.
+    pixels_matched: sum over both sides of every point-matcher call. turns: quarter turns anticlockwise by which the
+    point matcher saw the second image. seconds: by stage.
     """
 
     matches: Matches
@@ -312,4 +338,5 @@ class PairResult:
     fallback: str = ""
     notes: tuple[str, ...] = ()
     pixels_matched: int = 0
+    turns: int = 0
     seconds: Mapping[str, float] = field(default_factory=dict)

@@ -28,6 +28,7 @@ from sgam_core.options import (
     RejectionOptions,
     SemanticOptions,
     TileOptions,
+    TurningOptions,
 )
 from sgam_sfm.keypoints import KeypointOptions
 from sgam_sfm.shards import Shard
@@ -159,6 +160,8 @@ class MatchOptions:
     """Area matcher tiles."""
     covisible: CovisibleOptions = field(default_factory=CovisibleOptions)
     """Area matcher covisible."""
+    turning: TurningOptions = field(default_factory=TurningOptions)
+    """Photos taken upright and sideways."""
     geometry: GeometryOptions = field(default_factory=GeometryOptions)
     """Robust epipolar geometry."""
     prediction: PredictionOptions = field(default_factory=PredictionOptions)

@@ -35,6 +35,7 @@ from sgam_sfm.files import replacing
 from sgam_sfm.pairs import Pair
 
 _ARRAYS = tuple(array.name for array in fields(Matches))
+_FACTS = ("fallback", "coverage0", "coverage1", "whole_scale0", "whole_scale1", "notes", "pixels_matched", "turns")
 _AREAS = TypeAdapter(tuple[AreaMatch, ...])
 _DIGEST_BLOCK = 512  # bytes before the HDF5 file proper: the smallest user block there is
 _MAX_MATCHES = 10**8  # of a block: a file made by hand can claim any number in a few bytes
@@ -132,10 +133,7 @@ def _write_records(file: h5py.File, records: Sequence[PairRecord]) -> None:
 
 def _facts(result: PairResult) -> dict[str, Any]:
     """A result but for its matches and times (times differ between runs, a block's content does not)."""
-    facts = {
-        name: getattr(result, name)
-        for name in ("fallback", "coverage0", "coverage1", "whole_scale0", "whole_scale1", "notes", "pixels_matched")
-    }
+    facts = {name: getattr(result, name) for name in _FACTS}
     model = result.two_view
     two_view = None if model is None else {name: getattr(model, name) for name in TwoViewModel.__slots__}
     if two_view is not None:

@@ -53,6 +53,7 @@ class CountedPairs:
         self._totals["raw_matches"] += len(result.matches)
         self._totals["pixels_matched"] += result.pixels_matched
         self._totals["pairs_with_limits"] += bool(result.notes)
+        self._totals["pairs_turned"] += bool(result.turns)
         self._coverage += (result.coverage0 + result.coverage1) / 2
         if result.fallback:
             self._fallbacks[result.fallback.partition(":")[0]] += 1
@@ -73,6 +74,7 @@ class CountedPairs:
             "mean_coverage": self._coverage / max(self._totals["pairs"], 1),
             "mean_resolution_gain": self._scale / max(self._totals["areas_kept"], 1),
             "pairs_with_limits": self._totals["pairs_with_limits"],
+            "pairs_turned": self._totals["pairs_turned"],
             "raw_matches": self._totals["raw_matches"],
             "pixels_matched": self._totals["pixels_matched"],
         }

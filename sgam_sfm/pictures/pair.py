@@ -122,6 +122,8 @@ def _facts(picture: PairPicture) -> list[str]:
         ]
     if result.fallback:
         lines.append(f"Matched as whole images: {result.fallback}.")
+    if result.turns:
+        lines.append(f"The right image was turned anticlockwise by {90 * result.turns} degrees to be matched.")
     if result.notes:
         lines.append(f"Limits reached: {'; '.join(result.notes)}.")
     if picture.missing:

@@ -88,3 +88,21 @@ def test_an_image_that_is_not_rgb_is_named(unchecked):
 def test_an_empty_box_is_refused():
     with pytest.raises(ShapeError, match="is empty; expected x0 < x1"):
         Box(x0=3, y0=0, x1=3, y1=2)
+
+
+@given(st.integers(1, 60), st.integers(1, 60), st.integers(1, 90), st.integers(0, 3), st.integers(0, 3))
+def test_a_turned_crop_is_the_crop_turned_anticlockwise(width, height, long_side, turns, more):
+    crop = whole_crop(image(width, height, mask=np.eye(height, width, dtype=bool)), CropOptions(image_size=long_side))
+    turned = crop.turned(turns).turned(more)
+    np.testing.assert_array_equal(turned.pixels(), np.rot90(crop.pixels(), turns + more))
+    np.testing.assert_array_equal(turned.mask(), np.rot90(crop.mask(), turns + more))
+    assert turned.size == turned.pixels().shape[1::-1]
+    assert turned.scale == crop.scale
+    assert (turned.key == crop.key) == ((turns + more) % 4 == 0)
+    rows, columns = np.mgrid[: crop.size[1], : crop.size[0]]
+    centres = np.stack([columns, rows], axis=2) + 0.5
+    moved = np.rot90(centres, turns + more).reshape(-1, 2)  # where each pixel of the turned crop was before
+    seen = np.stack(np.meshgrid(*(np.arange(side) + 0.5 for side in turned.size)), axis=2).reshape(-1, 2)
+    np.testing.assert_allclose(turned.to_image(seen), crop.to_image(moved), atol=1e-9)
+    affine = turned.crop_from_image
+    np.testing.assert_allclose(turned.to_image(seen) @ affine[:, :2].T + affine[:, 2], seen, atol=1e-9)

@@ -1,0 +1,77 @@
+"""Photos taken sideways: found out by quarter turns, and matched as if they were upright."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from sgam_core import SemanticAreaMatcher, SGAMOptions, WholeImages, match_described
+from sgam_core.geometry import residuals
+from sgam_core.options import changed
+from sgam_core.types import Image, PairResult
+from sgam_sfm.matchers.xfeat import XFeatStar
+from tests.room import Room, TrueMatcher
+
+PAIR = ("view03.jpg", "view04.jpg")
+
+
+@dataclass(frozen=True)
+class Upright:
+    """The true matcher, for which the second image was stored turned by `turns` and is nothing but noise as it is."""
+
+    true: TrueMatcher
+    turns: int
+
+    def match(self, pairs):
+        noise = replace(self.true, points=0, known={})
+        upright = [(crop1.turns + self.turns) % 4 == 0 for _, crop1 in pairs]
+        return [(self.true if seen else noise).match([pair])[0] for seen, pair in zip(upright, pairs, strict=True)]
+
+
+def matched(room: Room, matcher, options: SGAMOptions, images: tuple[Image, Image] | None = None) -> PairResult:
+    image0, image1 = images or (room.images[name] for name in PAIR)
+    areas = SemanticAreaMatcher(options=options.semantic)
+    labels = np.zeros((120, 160), np.int32)  # nothing to make areas of: guided ones are left
+    return match_described(
+        image0, image1, areas.describe(image0, labels), areas.describe(image1, labels), areas, matcher, options
+    )
+
+
+@pytest.mark.parametrize("stored", range(4))
+def test_the_second_image_is_turned_back(room, stored):
+    options = changed(SGAMOptions(), crop__image_size=320)
+    result = matched(room, Upright(TrueMatcher(room), stored), options)
+    assert result.turns == (4 - stored) % 4
+    assert result.two_view is not None
+    assert result.two_view.num_inliers > 100
+    assert any(area.area0.kind == "guided" for area in result.areas)
+
+
+def test_images_that_show_nothing_in_common_stay_as_they_are(room):
+    result = matched(room, TrueMatcher(room, points=0), SGAMOptions())
+    assert result.turns == 0
+
+
+def test_it_can_be_turned_off_and_plain_matching_stays_plain(room):
+    matcher = Upright(TrueMatcher(room), 1)
+    assert matched(room, matcher, changed(SGAMOptions(), turning__enabled=False)).turns == 0
+    images = [room.images[name] for name in PAIR]
+    plain = match_described(*images, None, None, WholeImages(), matcher, SGAMOptions())
+    assert plain.turns == 0
+    assert plain.two_view is None or plain.two_view.num_inliers < 20
+
+
+def test_a_learned_matcher_finds_sideways_what_it_finds_upright(room):
+    options = changed(SGAMOptions(), crop__image_size=480)
+    image0, image1 = (room.images[name] for name in PAIR)
+    sideways = Image(name="sideways", pixels=np.ascontiguousarray(np.rot90(image1.pixels)))
+    upright = matched(room, XFeatStar(), options)
+    turned = matched(room, XFeatStar(), options, (image0, sideways))
+    assert turned.turns == 3
+    assert len(turned.matches) > 0.9 * len(upright.matches)
+    back = np.stack([image1.width - turned.matches.points1[:, 1], turned.matches.points1[:, 0]], axis=1)
+    assert upright.two_view is not None
+    stored = replace(turned.matches, points1=back)
+    assert (residuals(upright.two_view.F, stored) < options.geometry.max_residual).mean() > 0.9
