@@ -169,9 +169,9 @@ def camera_matrix(info: CameraInfo) -> Float[np.ndarray, "3 3"] | None:
 
 
 def camera_of_part(
-    info: CameraInfo, origin: tuple[int, int], part: tuple[int, int], size: tuple[int, int]
+    info: CameraInfo, origin: tuple[int, int], part: tuple[int, int], size: tuple[int, int], turns: int = 0
 ) -> KnownCamera:
-    """The camera of a part of an image, resized.
+    """The camera of a part of an image, resized, then turned by quarters anticlockwise.
 
     Args: origin: (x0, y0) of the part in the image. part, size: its (width, height) there and after resizing.
     """
@@ -180,9 +180,25 @@ def camera_of_part(
     camera.principal_point_y -= origin[1]
     camera.width, camera.height = part
     camera.rescale(*size)
+    for _ in range(turns):
+        _turn(camera)
     return KnownCamera(
         model=info.model, params=tuple(map(float, camera.params)), width=camera.width, height=camera.height
     )
+
+
+def _turn(camera: pycolmap.Camera) -> None:
+    """Turn a camera anticlockwise by a quarter, in place: (x, y) becomes (y, width - x)."""
+    before = dict(zip(camera.params_info.split(", "), map(float, camera.params), strict=True))
+    after = before | {"cx": before["cy"], "cy": camera.width - before["cx"]}
+    if "fx" in before:
+        after |= {"fx": before["fy"], "fy": before["fx"]}
+    if "p1" in before:
+        after |= {"p1": -before["p2"], "p2": before["p1"]}
+    if "sx1" in before:
+        after |= {"sx1": before["sy1"], "sy1": -before["sx1"]}
+    camera.params = list(after.values())
+    camera.width, camera.height = camera.height, camera.width
 
 
 def write_cameras(path: Path, cameras: Mapping[str, KnownCamera]) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 
 from sgam_sfm.comparison.figures import FIGURES, TIMES, Figure, Spread, figures_of, over_seeds, times_of, verdict
-from sgam_sfm.comparison.harder import Cut, cut_collection, cut_folder, parse_cut
+from sgam_sfm.comparison.harder import Cut, cut_collection, cut_folder, cut_views, parse_cut, read_windows
 from sgam_sfm.comparison.methods import Method, budget_reference, parse_methods
 from sgam_sfm.comparison.options import CompareOptions
 from sgam_sfm.comparison.running import Job, run_apart
@@ -55,7 +55,8 @@ def compare(options: CompareOptions, console: Console) -> dict[str, Any]:
     write_pairs(options.output / "pairs.txt", pairs)
     common = replace(common, pairs=options.output / "pairs.txt")
     names = sorted({name for pair in pairs for name in pair})
-    views = {} if truth is None else truth.views_of(names)
+    windows = read_windows(cut_folder(options.output, cut))
+    views = {} if truth is None else cut_views(truth.views_of(names), windows)
     poses = {name: pose for name, view in views.items() if (pose := view.cam_from_world) is not None}
 
     results: dict[str, list[dict[str, Any]]] = {method.slug: [] for method in methods}

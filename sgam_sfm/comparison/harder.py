@@ -39,29 +39,31 @@ class Cut:
     """A harder cut. The images are numbered by name.
 
     every: only every so many-th image is kept, with the pairs among them. scale: of the images' sides, at most 1. zoom:
-    of every other kept image only the centre is left, so many times less wide and high, at its own resolution.
+    of every other kept image only the centre is left, so many times less wide and high, at its own resolution. turn:
+    every other kept image is turned anticlockwise by so many quarters, as if the camera had been held sideways.
     """
 
     every: int = 1
     scale: float = 1.0
     zoom: float = 1.0
+    turn: int = 0
 
     @property
     def changes_images(self) -> bool:
         """Whether images are cut, and not only left out."""
-        return self.scale != 1 or self.zoom != 1
+        return self.scale != 1 or self.zoom != 1 or self.turn != 0
 
     def __str__(self) -> str:
         """As it is written on the command line; empty for the whole collection."""
-        values = ((option.name, getattr(self, option.name)) for option in fields(self))
-        return " ".join(f"{name}={value:g}" for name, value in values if value != 1)
+        values = ((option, getattr(self, option.name)) for option in fields(self))
+        return " ".join(f"{option.name}={value:g}" for option, value in values if value != option.default)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Window:
     """What is left of an image: its part from (x0, y0) on, width x height pixels, resized to `size` (width, height).
 
-    whole: (width, height) of the image.
+    whole: (width, height) of the image. turns: quarter turns anticlockwise of what is left.
     """
 
     whole: tuple[int, int]
@@ -70,6 +72,7 @@ class Window:
     width: int
     height: int
     size: tuple[int, int]
+    turns: int = 0
 
     def view(self, whole: TrueView) -> TrueView:
         """The true camera of the window, of that of the image at any size."""
@@ -77,14 +80,31 @@ class Window:
         to_part = np.array([[1, 0, -self.x0], [0, 1, -self.y0], [0, 0, 1]])
         to_size = np.diag([self.size[0] / self.width, self.size[1] / self.height, 1])
         matrix = to_size @ to_part @ to_image @ whole.camera_matrix
-        return replace(whole, width=self.size[0], height=self.size[1], camera_matrix=matrix)
+        view = replace(whole, width=self.size[0], height=self.size[1], camera_matrix=matrix)
+        for _ in range(self.turns):
+            view = _turned_view(view)
+        return view
 
     def of(self, pixels: np.ndarray, interpolation: int) -> np.ndarray:
         """The window of an array (H, W) or (H, W, C)."""
         part = pixels[self.y0 : self.y0 + self.height, self.x0 : self.x0 + self.width]
-        if self.size == (self.width, self.height):
-            return np.ascontiguousarray(part)
-        return cv2.resize(part, self.size, interpolation=interpolation)
+        if self.size != (self.width, self.height):
+            part = cv2.resize(part, self.size, interpolation=interpolation)
+        return np.ascontiguousarray(np.rot90(part, self.turns))
+
+
+def _turned_view(view: TrueView) -> TrueView:
+    """The camera of an image that is turned anticlockwise by a quarter: (x, y) becomes (y, width - x)."""
+    turn = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    moved = np.array([[1, 0, 0], [0, 1, view.width], [0, 0, 1]]) @ turn @ view.camera_matrix @ turn.T
+    pose = None if view.cam_from_world is None else turn @ view.cam_from_world
+    distortion = view.distortion
+    if distortion:
+        k1, k2, p1, p2, *more = distortion
+        distortion = (k1, k2, -p2, p1, *more)
+    return replace(
+        view, width=view.height, height=view.width, camera_matrix=moved, cam_from_world=pose, distortion=distortion
+    )
 
 
 def cut_folder(output: Path, cut: Cut | str) -> Path:
@@ -102,7 +122,9 @@ def parse_cut(texts: Sequence[str], scene_scale: float = 1.0) -> Cut:
         name, _, number = text.partition("=")
         if name not in Cut.__dataclass_fields__:
             hint = did_you_mean(name, Cut.__dataclass_fields__)
-            raise OptionError(f"--hard '{text}': '{name}' is unknown; {hint}expected every=K, scale=S or zoom=Z")
+            raise OptionError(
+                f"--hard '{text}': '{name}' is unknown; {hint}expected every=K, scale=S, zoom=Z or turn=Q"
+            )
         if name in values:
             raise OptionError(f"--hard '{text}': {name} is given twice")
         try:
@@ -112,7 +134,12 @@ def parse_cut(texts: Sequence[str], scene_scale: float = 1.0) -> Cut:
     every = values.get("every", 1.0)
     if every % 1 != 0 or every < 1:  # also nan and infinity
         raise OptionError(f"--hard every={every:g}: expected a whole number of at least 1")
-    cut = Cut(every=int(every), scale=values.get("scale", 1.0) * scene_scale, zoom=values.get("zoom", 1.0))
+    turn = values.get("turn", 0.0)
+    if turn not in range(4):
+        raise OptionError(f"--hard turn={turn:g}: expected quarter turns, 1, 2 or 3")
+    cut = Cut(
+        every=int(every), scale=values.get("scale", 1.0) * scene_scale, zoom=values.get("zoom", 1.0), turn=int(turn)
+    )
     if not 0 < cut.scale <= 1:
         raise OptionError(f"images are to be scaled by {cut.scale:g}; expected more than 0 and at most 1")
     if not 1 <= cut.zoom < np.inf:
@@ -137,8 +164,8 @@ def cut_collection(cut: Cut, options: MatchOptions, inputs: Inputs, folder: Path
     options = replace(options, pairs=folder / "pairs.txt")
     if not cut.changes_images:
         return options
-    zoomed = {*kept[1::2]}
-    windows = {name: _window(inputs.images[name], cut, zoomed=name in zoomed) for name in kept}
+    others = {*kept[1::2]}
+    windows = {name: _window(inputs.images[name], cut, other=name in others) for name in kept}
     record = folder / _RECORD
     mark = fingerprint(options, images=inputs.digests, cut=cut)
     if not record.exists() or _read(record)["fingerprint"] != mark:
@@ -161,7 +188,7 @@ def cut_collection(cut: Cut, options: MatchOptions, inputs: Inputs, folder: Path
         cameras=folder / "cameras.txt" if cameras else None,
         camera_params="",
         # Images of several sizes cannot share the one camera that their folder had.
-        camera_mode=options.camera_mode if cut.zoom == 1 else "per-image",
+        camera_mode=options.camera_mode if cut.zoom == 1 and not cut.turn else "per-image",
         refine_intrinsics=options.refine_intrinsics or not given,
     )
 
@@ -172,8 +199,13 @@ def read_windows(folder: Path) -> dict[str, Window]:
     return TypeAdapter(dict[str, Window]).validate_python(_read(record)["windows"]) if record.exists() else {}
 
 
-def _window(image: ImageFile, cut: Cut, *, zoomed: bool) -> Window:
-    zoom = cut.zoom if zoomed else 1.0
+def cut_views(views: Mapping[str, TrueView], windows: Mapping[str, Window]) -> dict[str, TrueView]:
+    """The true cameras of what is left of images; the images' own where they are whole."""
+    return {name: windows[name].view(view) if name in windows else view for name, view in views.items()}
+
+
+def _window(image: ImageFile, cut: Cut, *, other: bool) -> Window:
+    zoom = cut.zoom if other else 1.0
     width, height = (max(1, round(side / zoom)) for side in (image.width, image.height))
     return Window(
         whole=(image.width, image.height),
@@ -182,6 +214,7 @@ def _window(image: ImageFile, cut: Cut, *, zoomed: bool) -> Window:
         width=width,
         height=height,
         size=(max(1, round(width * cut.scale)), max(1, round(height * cut.scale))),
+        turns=cut.turn if other else 0,
     )
 
 
@@ -228,7 +261,7 @@ def _save(path: Path, pixels: np.ndarray) -> None:
 
 def _cameras(cameras: Mapping[str, CameraInfo], windows: Mapping[str, Window]) -> dict[str, KnownCamera]:
     return {
-        name: camera_of_part(camera, (window.x0, window.y0), (window.width, window.height), window.size)
+        name: camera_of_part(camera, (window.x0, window.y0), (window.width, window.height), window.size, window.turns)
         for name, camera in cameras.items()
         for window in (windows[name],)
     }

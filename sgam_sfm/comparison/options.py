@@ -26,7 +26,8 @@ class CompareOptions(MatchOptions):
     """Runs with different seeds; differences within their spread are ties."""
     hard: tuple[str, ...] = ()
     """A harder cut of the photos: every=K (every K-th of them), scale=S (scaled down), zoom=Z (of every other one the
-    centre alone, so that scale changes within pairs)."""
+    centre alone, so that scale changes within pairs), turn=Q (every other one by Q quarter turns, as if the camera had
+    been held sideways)."""
     scene_scale: float = 1.0
     """Scale all photos by this before anything else, for a first table in less time."""
     max_pairs: int = 0

@@ -29,6 +29,7 @@ QUIET = Stages(quiet=True)
         ((), 1.0, Cut()),
         (("every=2", "zoom=2.5"), 1.0, Cut(every=2, zoom=2.5)),
         (("scale=0.5",), 0.5, Cut(scale=0.25)),
+        (("turn=3",), 1.0, Cut(turn=3)),
     ],
 )
 def test_cuts_are_read(texts, scene_scale, cut):
@@ -38,13 +39,14 @@ def test_cuts_are_read(texts, scene_scale, cut):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("zom=2", "--hard 'zom=2': 'zom' is unknown; did you mean 'zoom'? expected every=K, scale=S or zoom=Z"),
+        ("zom=2", "--hard 'zom=2': 'zom' is unknown; did you mean 'zoom'? expected every=K, scale=S, zoom=Z or turn=Q"),
         ("zoom=two", "--hard 'zoom=two': 'two' is not a number"),
         ("zoom", "--hard 'zoom': '' is not a number"),
         ("every=1.5", "--hard every=1.5: expected a whole number of at least 1"),
         ("every=nan", "--hard every=nan: expected a whole number of at least 1"),
         ("scale=2", "images are to be scaled by 2; expected more than 0 and at most 1"),
         ("zoom=0.5", "--hard zoom=0.5: expected at least 1"),
+        ("turn=90", "--hard turn=90: expected quarter turns, 1, 2 or 3"),
     ],
 )
 def test_wrong_cuts_are_named(text, message):
@@ -56,6 +58,7 @@ def test_wrong_cuts_are_named(text, message):
 def test_a_cut_is_written_as_it_is_asked_for():
     assert str(Cut()) == ""
     assert str(Cut(every=2, zoom=2.5)) == "every=2 zoom=2.5"
+    assert str(Cut(turn=1)) == "turn=1"
     assert cut_folder(Path("out"), Cut(every=2, zoom=2.5)).name == "hard_every-2_zoom-2.5"
 
 
@@ -97,6 +100,53 @@ def test_a_point_falls_on_the_same_thing_before_and_after(x0, y0, size, point):
     scale = np.diag([size[0] / 400, size[1] / 300, 1])
     shift = np.array([[1, 0, -x0], [0, 1, -y0], [0, 0, 1]])
     np.testing.assert_allclose(window.view(whole).camera_matrix, scale @ shift @ expected)
+
+
+@given(
+    model=st.sampled_from(["SIMPLE_RADIAL", "PINHOLE", "FULL_OPENCV", "THIN_PRISM_FISHEYE"]),
+    turns=st.integers(0, 3),
+    point=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)),
+)
+def test_a_turned_camera_sees_the_same_thing_turned(model, turns, point):
+    """COLMAP's camera, the true one with its pose, and the pixels themselves turn alike."""
+    camera = pycolmap.Camera(model=model, width=800, height=600)
+    named = {"f": 700.0, "fx": 700.0, "fy": 710.0, "cx": 395.0, "cy": 310.0, "p1": 0.003, "p2": -0.002, "sx1": 0.004}
+    camera.params = [named.get(name, 0.001) for name in camera.params_info.split(", ")]
+    info = CameraInfo(
+        image_id=1,
+        camera_id=1,
+        model=model,
+        params=tuple(camera.params),
+        width=800,
+        height=600,
+        has_prior_focal=True,
+        known=True,
+    )
+    after = camera_of_part(info, (0, 0), (800, 600), (800, 600), turns)
+    turned = pycolmap.Camera(model=model, width=after.width, height=after.height, params=after.params)
+    x, y = camera.img_from_cam(np.array([*point, 1.0]))
+    expected, seen = np.array([x, y]), np.array([*point, 1.0])
+    view = TrueView(
+        name="a",
+        width=800,
+        height=600,
+        camera_matrix=camera.calibration_matrix(),
+        cam_from_world=np.eye(3, 4),
+        distortion=(0.01, 0.02, 0.003, -0.004),
+    )
+    straight = view.undistorted(expected[None])
+    sides = (800, 600)
+    for _ in range(turns):
+        expected, seen = np.array([expected[1], sides[0] - expected[0]]), np.array([seen[1], -seen[0], seen[2]])
+        straight = np.stack([straight[:, 1], sides[0] - straight[:, 0]], axis=1)
+        sides = sides[::-1]
+    np.testing.assert_allclose(turned.img_from_cam(seen), expected, atol=1e-6)
+    window = Window(whole=(800, 600), x0=0, y0=0, width=800, height=600, size=(800, 600), turns=turns)
+    there = window.view(view)
+    assert (there.width, there.height) == (turned.width, turned.height) == sides
+    np.testing.assert_allclose(there.camera_matrix, turned.calibration_matrix(), atol=1e-9)
+    np.testing.assert_allclose(there.cam_from_world @ [*point, 1.0, 1.0], seen, atol=1e-9)
+    np.testing.assert_allclose(there.undistorted(expected[None]), straight, atol=1e-3)
 
 
 @pytest.fixture
@@ -144,6 +194,20 @@ def test_everything_of_an_image_is_cut_alike(options):
     np.testing.assert_array_equal(mask[0] > 0, np.arange(20) >= 10)
     np.testing.assert_array_equal(labels[0], 1 + (np.arange(20) >= 10))
     assert read_windows(folder)["sub/d.tif"] == Window(whole=(80, 60), x0=20, y0=15, width=40, height=30, size=(20, 15))
+
+
+def test_every_other_image_is_turned_with_all_that_belongs_to_it(options):
+    cut = Cut(turn=1)
+    harder = cut_of(options, cut)
+    inputs = read_inputs(replace(harder, output=options.output / "again"), QUIET)
+    sizes = {name: (file.width, file.height) for name, file in inputs.images.items()}
+    assert sizes == {"a.png": (80, 60), "b.jpg": (60, 80), "sub/c 1.png": (80, 60), "sub/d.tif": (60, 80)}
+    np.testing.assert_allclose(inputs.cameras["sub/d.tif"].params, (100, 100, 29, 80 - 41))
+    folder = cut_folder(options.output, cut)
+    pixels = np.asarray(PIL.Image.open(folder / "images" / "sub" / "d.tif"))
+    np.testing.assert_array_equal(pixels[0, :3], [[79, 0, 7], [79, 1, 7], [79, 2, 7]])
+    mask = np.asarray(PIL.Image.open(folder / "masks" / "sub" / "d.tif.png"))
+    np.testing.assert_array_equal(mask[:, 0] > 0, np.arange(80) < 40)
 
 
 def test_a_cut_that_is_there_is_not_made_again(options):

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from sgam_core.errors import InputError
 from sgam_sfm.colmap_reading import read_poses_and_points
-from sgam_sfm.comparison.harder import Window
+from sgam_sfm.comparison.harder import Window, cut_views
 from sgam_sfm.comparison.report.bounds import Bounds, evenly_of
 from sgam_sfm.comparison.report.runs import MethodRun, PairMatches, read_matches
 from sgam_sfm.evaluation.ground_truth import GroundTruth, TrueView, read_ground_truth
@@ -67,7 +67,7 @@ def true_views(
     except InputError:
         return TrueViews({}, "the ground truth is no longer where it was")
     posed = {name: view for name, view in found.items() if view.cam_from_world is not None}
-    views = {name: windows[name].view(view) if windows else view for name, view in posed.items()}
+    views = cut_views(posed, windows or {})
     return TrueViews(views, "" if views else "the ground truth has no pose of these images")
 
 
