@@ -21,6 +21,7 @@ from sgam_core.prediction import Estimate, MatchedArea, predict
 from sgam_core.protocols import AreaMatcher, PointMatcher
 from sgam_core.rejection import reject
 from sgam_core.semantic import SemanticAreaMatcher
+from sgam_core.support import supported
 from sgam_core.types import AreaMatch, AreaState, Box, Crop, Image, Matches, PairResult, PutativeAreas, TwoViewModel
 
 
@@ -83,9 +84,11 @@ def match_described(
     first = _plain(points, estimate, options) if guides else None
     clock.lap("whole images")
     if first is None:
-        first = _by_areas(
-            lambda: area_matcher.match(description0, description1, points.whole), points, estimate, options, clock
-        )
+        putative = area_matcher.match(description0, description1, points.whole)
+        if guides and options.guidance.max_chance < 1:
+            putative = supported(putative, points.whole(), options.guidance.max_chance)
+        clock.lap("area matching")
+        first = _by_areas(putative, points, estimate, options, clock)
     found = _guided(first, points, estimate, options) or first if guides else first
     clock.lap("guided areas")
     coverage0, coverage1 = _coverages(found.areas, points)
@@ -142,11 +145,9 @@ def _turns(points: _Points, estimate: Estimate, options: SGAMOptions) -> int:
 
 
 def _by_areas(
-    propose: Callable[[], PutativeAreas], points: _Points, estimate: Estimate, options: SGAMOptions, clock: _Clock
+    putative: PutativeAreas, points: _Points, estimate: Estimate, options: SGAMOptions, clock: _Clock
 ) -> _Found:
-    """The paper's algorithm: SAM, PM, GP, GR, GMC."""
-    putative = propose()
-    clock.lap("area matching")
+    """The paper's algorithm after SAM: PM, GP, GR, GMC."""
     confident, doubtful = points.inside(putative, options.prediction.max_candidates)
     if options.collection.min_coverage >= 1:
         points.whole()  # GMC asks for them in any case, and GR judges better with them
@@ -374,7 +375,12 @@ def _scaled_crop(image: Image, box: Box, scale: float) -> Crop:
 
 def _limit_candidates(groups: Sequence[Sequence[AreaMatch]], max_candidates: int) -> list[list[AreaMatch]]:
     """The groups with the candidates beyond the limit marked as skipped, the farthest in descriptor distance first."""
-    distances = sorted((c.distance, g, k) for g, group in enumerate(groups) for k, c in enumerate(group))
+    distances = sorted(
+        (c.distance, g, k)
+        for g, group in enumerate(groups)
+        for k, c in enumerate(group)
+        if c.state is not AreaState.SKIPPED
+    )
     dropped = {(g, k) for _, g, k in distances[max_candidates:]}
     reason = "GP: limit of candidate pairs (max_candidates)"
     return [

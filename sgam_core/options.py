@@ -249,6 +249,9 @@ class GuidanceOptions(_Checked):
     """So many consistent whole-image matches need no areas to find more evidence (0: areas always)."""
     sure_inlier_ratio: float = 0.5
     """And so large a share of all of them is consistent."""
+    max_chance: float = 0.01
+    """Where they do not agree, area pairs are matched that whole-image matches join more often than chance: the largest
+    probability of chance (1: all area pairs)."""
     min_matches: int = 20
     """Fewest consistent matches for a window."""
     quantile: float = 0.02
