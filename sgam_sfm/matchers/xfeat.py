@@ -32,7 +32,7 @@ from sgam_sfm.matchers.feature_cache import FeatureCache
 from sgam_sfm.matchers.masks import wanted
 from sgam_sfm.matchers.sparse import batch_size as together
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
-from sgam_sfm.matchers.subpixel import aligned
+from sgam_sfm.matchers.subpixel import aligned, intensities
 from sgam_sfm.weights import XFEAT, find_weights
 
 CELL = 8  # pixels of the network's input per cell
@@ -46,19 +46,21 @@ MIN_FEATURES = 64  # of a crop, however small
 class _Features:
     """The features of one crop, in crop pixels.
 
-    descriptors: (K, 64), not normalised. centers: (K, 2), of their cells. steps: (K, 2), size of a network pixel.
+    descriptors: (K, 64), not normalised. centers: (K, 2), of their cells. steps: (K, 2), size of a network pixel. gray:
+    (h, w), of the whole crop, which takes long to cut out of a photo again.
     """
 
     descriptors: Tensor
     centers: Tensor
     steps: Tensor
+    gray: np.ndarray
 
     @property
     def nbytes(self) -> int:
-        return self.descriptors.nbytes + self.centers.nbytes + self.steps.nbytes
+        return self.descriptors.nbytes + self.centers.nbytes + self.steps.nbytes + self.gray.nbytes
 
     def select(self, rows: Tensor) -> _Features:
-        return _Features(self.descriptors[rows], self.centers[rows], self.steps[rows])
+        return _Features(self.descriptors[rows], self.centers[rows], self.steps[rows], self.gray)
 
 
 class XFeatStar:
@@ -150,21 +152,22 @@ class XFeatStar:
 
         good = (confidences1 > self.min_confidence).cpu().numpy() & wanted(crop0, points0) & wanted(crop1, points1)
         matches = Matches(points0=points0[good], points1=points1[good], scores=scores[good])
-        return aligned(crop0, crop1, matches) if self.photometric else matches
+        return aligned(crop0, crop1, matches, (features0.gray, features1.gray)) if self.photometric else matches
 
     def _extract(self, crops: Sequence[Crop]) -> list[_Features]:
         """The features of crops of one size, which go through the network together."""
         width, height = crops[0].size
-        gray = torch.stack([torch.from_numpy(crop.pixels()).to(self.device).float().mean(-1) for crop in crops])
+        pixels = [crop.pixels() for crop in crops]
+        gray = torch.stack([torch.from_numpy(each).to(self.device).float().mean(-1) for each in pixels])
         budget = max(MIN_FEATURES, round(self.features_per_megapixel * width * height / 1e6))
         scales = [self._extract_at(scale, round(share * budget), gray, crops) for scale, share in self.shares if share]
         return [
-            _Features(*(torch.cat([getattr(part, name) for part in parts]) for name in _Features.__slots__))
-            for parts in zip(*scales, strict=True)
+            _Features(*(torch.cat(of_scales) for of_scales in zip(*parts, strict=True)), gray=intensities(own))
+            for own, *parts in zip(pixels, *scales, strict=True)
         ]
 
-    def _extract_at(self, scale: float, count: int, gray: Tensor, crops: Sequence[Crop]) -> list[_Features]:
-        """The `count` most reliable cells of each crop, seen at `scale` of its size."""
+    def _extract_at(self, scale: float, count: int, gray: Tensor, crops: Sequence[Crop]) -> list[tuple[Tensor, ...]]:
+        """The `count` most reliable cells of each crop, seen at `scale` of its size: descriptors, centers, steps."""
         size = crops[0].size
         width, height = (max(MULTIPLE, round(scale * side / MULTIPLE) * MULTIPLE) for side in size)
         images = interpolate(gray[:, None], (height, width), mode="bilinear", align_corners=False)
@@ -181,7 +184,7 @@ class XFeatStar:
                 best = best[torch.from_numpy(wanted(crop, centers.cpu().numpy())).to(self.device)[best]]
             best = best[:count]
             descriptors = own_map.flatten(1).T[best].contiguous()
-            found.append(_Features(descriptors, centers[best], step.expand(len(best), 2)))
+            found.append((descriptors, centers[best], step.expand(len(best), 2)))
         return found
 
     def _offsets(self, here: _Features, there: _Features) -> tuple[Tensor, Tensor]:
