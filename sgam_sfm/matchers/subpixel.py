@@ -145,5 +145,4 @@ def _patches(gray: np.ndarray, points: np.ndarray, offsets: np.ndarray) -> tuple
     )
     patches -= (patches @ _WINDOW)[:, None]
     deviation = np.sqrt(patches**2 @ _WINDOW)
-    patches /= np.maximum(deviation, 1e-6)[:, None]
-    return patches, deviation
+    return np.divide(patches, np.maximum(deviation, 1e-6)[:, None], out=patches), deviation

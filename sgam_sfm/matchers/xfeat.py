@@ -63,6 +63,10 @@ class _Features:
         return _Features(self.descriptors[rows], self.centers[rows], self.steps[rows], self.gray)
 
 
+_Cells = tuple[Tensor, Tensor, Tensor]
+"""Descriptors, centers and steps, as in `_Features`, of one scale."""
+
+
 class XFeatStar:
     """Point matcher (`sgam_core.protocols.PointMatcher`): XFeat, semi-dense.
 
@@ -161,13 +165,14 @@ class XFeatStar:
         gray = torch.stack([torch.from_numpy(each).to(self.device).float().mean(-1) for each in pixels])
         budget = max(MIN_FEATURES, round(self.features_per_megapixel * width * height / 1e6))
         scales = [self._extract_at(scale, round(share * budget), gray, crops) for scale, share in self.shares if share]
-        return [
-            _Features(*(torch.cat(of_scales) for of_scales in zip(*parts, strict=True)), gray=intensities(own))
-            for own, *parts in zip(pixels, *scales, strict=True)
-        ]
+        found = []
+        for own, parts in zip(pixels, zip(*scales, strict=True), strict=True):
+            descriptors, centers, steps = (torch.cat(of_scales) for of_scales in zip(*parts, strict=True))
+            found.append(_Features(descriptors, centers, steps, intensities(own)))
+        return found
 
-    def _extract_at(self, scale: float, count: int, gray: Tensor, crops: Sequence[Crop]) -> list[tuple[Tensor, ...]]:
-        """The `count` most reliable cells of each crop, seen at `scale` of its size: descriptors, centers, steps."""
+    def _extract_at(self, scale: float, count: int, gray: Tensor, crops: Sequence[Crop]) -> list[_Cells]:
+        """The `count` most reliable cells of each crop, seen at `scale` of its size."""
         size = crops[0].size
         width, height = (max(MULTIPLE, round(scale * side / MULTIPLE) * MULTIPLE) for side in size)
         images = interpolate(gray[:, None], (height, width), mode="bilinear", align_corners=False)
