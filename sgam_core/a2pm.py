@@ -115,7 +115,7 @@ class _Found:
 def _plain(points: _Points, estimate: Estimate, options: SGAMOptions) -> _Found | None:
     """The whole images, where they agree so well that areas have nothing to add but resolution."""
     whole, guidance = points.whole(), options.guidance
-    model = estimate(whole)
+    model = points.whole_model(estimate)
     if model is None or not guidance.sure_matches or model.num_inliers < guidance.sure_matches:
         return None
     if model.inlier_ratio < guidance.sure_inlier_ratio:
@@ -141,7 +141,11 @@ def _by_areas(
     if verdict.fallback:
         whole = points.whole()
         found = _Found(
-            matches=whole, model=estimate(whole), areas=final, fallback=verdict.fallback, notes=putative.notes
+            matches=whole,
+            model=points.whole_model(estimate),
+            areas=final,
+            fallback=verdict.fallback,
+            notes=putative.notes,
         )
     else:
         matches = _collected(final, verdict.model, points.whole, points, options)
@@ -241,6 +245,7 @@ class _Points:
         self.seconds = 0.0
         self.notes: tuple[str, ...] = ()
         self._whole: Matches | None = None
+        self._whole_model: list[TwoViewModel | None] = []  # empty until it is asked for
 
     @property
     def whole_is_known(self) -> bool:
@@ -252,6 +257,12 @@ class _Points:
             crop0, crop1 = (whole_crop(image, self.options) for image in self.images)
             self._whole = self._match([(crop0, crop1)])[0]
         return self._whole
+
+    def whole_model(self, estimate: Estimate) -> TwoViewModel | None:
+        """The geometry of the whole images' matches, estimated at the first call."""
+        if not self._whole_model:
+            self._whole_model.append(estimate(self.whole()))
+        return self._whole_model[0]
 
     def inside(self, putative: PutativeAreas, max_candidates: int) -> tuple[list[MatchedArea], list[list[MatchedArea]]]:
         """Point matches inside all confident areas and the doubtful candidates that the limits allow."""

@@ -39,11 +39,14 @@ def create_matcher(options: MatchOptions) -> PointMatcher:
     Raises: OptionError when its licence forbids commercial use and is not accepted, or for wrong options.
     """
     require_licence("matcher", options.matcher, options.accept_licence)
+    if options.precision != "auto" and not registry.takes("matcher", options.matcher, "precision"):
+        raise OptionError(f"--precision {options.precision}: '{options.matcher}' has no choice of it; leave it out")
     matcher: PointMatcher = registry.create(
         "matcher",
         options.matcher,
         weights=options.weights,
         device=options.device,
+        precision=options.precision,
         seed=options.seed,
         worker=WorkerCommand.of(options, "matcher", options.matcher),
     )

@@ -82,7 +82,8 @@ def connected(options: MatchOptions) -> Iterator[RayExecutor]:
         _require_room(need)
         own_device = "cpu" if device == "cpu" else str(find_device("auto"))
         use_threads(options.threads)
-        create_matcher(replace(options, device="cpu"))  # what is wrong with it is to be known before images are read
+        on_cpu = replace(options, device="cpu", precision="auto" if options.precision == "auto" else "full")
+        create_matcher(on_cpu)  # what is wrong with it is to be known before images are read
         yield RayExecutor(device=device, own_device=own_device, need=need)
     finally:
         if ours:

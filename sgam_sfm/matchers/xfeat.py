@@ -27,7 +27,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sgam_core.errors import OptionError
 from sgam_core.types import Crop, Matches
-from sgam_sfm.machine import find_device
+from sgam_sfm.machine import Precision, find_device, runs_half
 from sgam_sfm.matchers.feature_cache import FeatureCache
 from sgam_sfm.matchers.masks import wanted
 from sgam_sfm.matchers.sparse import batch_size as together
@@ -80,7 +80,8 @@ class XFeatStar:
 
     Args:
         weights: the model file; found by itself when omitted.
-        device: a torch device, such as `cpu` or `cuda:0`. On CUDA the network runs in half precision.
+        device: a torch device, such as `cpu` or `cuda:0`.
+        precision: of the network; `auto`: half on CUDA, full elsewhere.
         features_per_megapixel: how many cells of a crop are kept, by reliability.
         scales: the two sizes at which a crop is seen, as factors of its own.
         coarse_share: share of the features that comes from the first scale; 0 for the second scale alone.
@@ -101,6 +102,7 @@ class XFeatStar:
         weights: Path | None = None,
         device: str = "cpu",
         seed: int = 0,
+        precision: Precision = "auto",
         features_per_megapixel: int = 12_000,
         scales: tuple[float, float] = (0.6, 1.3),
         coarse_share: float = 0.1,
@@ -117,6 +119,7 @@ class XFeatStar:
         if min(scales) <= 0:
             raise OptionError(f"scales are {scales}; expected two positive factors")
         self.device = find_device(device)
+        self._half = runs_half(precision, self.device)
         self.features_per_megapixel = features_per_megapixel
         self.shares = ((scales[0], coarse_share), (scales[1], 1 - coarse_share))
         self.min_confidence = min_confidence
@@ -176,7 +179,7 @@ class XFeatStar:
         size = crops[0].size
         width, height = (max(MULTIPLE, round(scale * side / MULTIPLE) * MULTIPLE) for side in size)
         images = interpolate(gray[:, None], (height, width), mode="bilinear", align_corners=False)
-        with torch.autocast(self.device.type, torch.float16, enabled=self.device.type == "cuda"):
+        with torch.autocast(self.device.type, torch.float16, enabled=self._half):
             maps, _, reliability = self._net(images.contiguous(memory_format=torch.channels_last))
 
         cells_y, cells_x = torch.meshgrid(*(torch.arange(n, device=self.device) for n in maps.shape[2:]), indexing="ij")
