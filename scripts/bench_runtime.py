@@ -3,9 +3,10 @@
     python scripts/bench_runtime.py SCENE OUT [--pairs N] [--presets fast default] [--device cpu] [-- --matcher sift]
 
 SCENE: a Strecha or ScanNet folder, see `scenes.py`. --pairs: as many, spread evenly over all (0: all). Options after
-`--` go to all variants. Every block of pairs is matched by all variants in turn: whole images, then for each preset the
-areas and whole images of as many pixels (`@budget`), then whole images again, so that what slows the machine down slows
-down all. Only the ratios tell anything of another machine. Prints a Markdown table and, last, a line of JSON.
+`--` go to all variants, but for those of the algorithm, which the presets decide. Every block of pairs is matched by
+all variants in turn: whole images, then for each preset the areas and whole images of as many pixels (`none@PRESET`),
+then whole images again, so that what slows the machine down slows down all. Only the ratios tell anything of another
+machine. Prints a Markdown table and, last, a line of JSON. OUT/bench is begun anew.
 
 The plain matcher extracts features once an image and block, areas are extracted once a pair: `Mpx extracted` beside
 `Mpx matched` says how much of the time per pixel follows from that.
@@ -25,6 +26,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import tyro
 from scenes import scene_options, split_options
@@ -143,12 +145,14 @@ def main() -> None:
     arguments = parser.parse_args(own)
     flags = [*scene_options(arguments.scene), "--output", str(arguments.out), "--device", arguments.device, *passed_on]
     options = tyro.cli(EvaluateOptions, args=flags).matching
-    options = replace(options, device=str(find_device(options.device, "--device")))
+    work = arguments.out / "bench"  # begun anew: label maps that are there would take no time
+    shutil.rmtree(work, ignore_errors=True)
+    options = replace(options, output=work, device=str(find_device(options.device, "--device")))
     content = measured(options, arguments.presets, arguments.pairs)
     print(table(content["variants"], content["once"]))
     for target in content["targets"]:
-        print(f"\n{'met' if target['met'] else 'missed'}: {target['name']}: {target['value']:.3g}, at most "
-              f"{target['limit']:g}")  # fmt: skip
+        verdict = "met" if target["met"] else "missed"
+        print(f"\n{verdict}: {target['name']}: {target['value']:.3g}, at most {target['limit']:g}")
     print("\n" + json.dumps(content))
 
 
@@ -157,8 +161,6 @@ def measured(options: MatchOptions, presets: Sequence[str], num_pairs: int) -> d
     use_threads(options.threads)
     once: dict[str, float] = {}
     stages = Stages(quiet=True)
-    for name in ("pairs", "labels", *presets):
-        shutil.rmtree(options.output / name, ignore_errors=True)
     inputs = read_inputs(options, stages)
     chosen = tuple(spread_over(inputs.pairs.pairs, num_pairs))
     used = {name for pair in chosen for name in pair}
@@ -238,9 +240,9 @@ def _describing(options: MatchOptions, inputs: Inputs, labels: LabelMaps) -> flo
     matcher = create_area_matcher(options)
     usable = [name for name in inputs.images if name not in labels.set.failed]
     maps = {name: labels.read(name) for name in usable}
-    blank = {name: Image(name=name, pixels=read_image(inputs.images[name])) for name in usable[:1]}
-    first = next(iter(blank.values()))
-    return _mean_seconds([lambda name=name: matcher.describe(replace(first, name=name), maps[name]) for name in usable])
+    sizes = {name: (inputs.images[name].height, inputs.images[name].width, 3) for name in usable}
+    blank = {name: Image(name=name, pixels=np.broadcast_to(np.uint8(0), size)) for name, size in sizes.items()}
+    return _mean_seconds([lambda name=name: matcher.describe(blank[name], maps[name]) for name in usable])
 
 
 def _mean_seconds(calls: Sequence[Any]) -> float:
@@ -253,7 +255,6 @@ def _mean_seconds(calls: Sequence[Any]) -> float:
 def _rest(variant: Variant, name: str, inputs: Inputs, labels: LabelMaps | None, num_blocks: int) -> dict[str, float]:
     """Merge, verify and map what a variant found."""
     output = variant.options.output / "models" / name.replace(" ", "-").replace("@", "-")
-    shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)
     options = replace(variant.options, output=output)
     shutil.copy(variant.options.output / "cameras.db", output / "cameras.db")
@@ -290,8 +291,7 @@ def targets(
 ) -> list[dict[str, Any]]:
     """The figures that have a limit, and whether they keep it.
 
-    Times at one input size are those of segmentation and matching together, against matching alone; times per pixel are
-    of matching, at the same number of pixels.
+    Times are of matching, reading of images included.
     """
     found = []
 
@@ -300,20 +300,24 @@ def targets(
 
     for preset in presets:
         own, plain = figures[preset], figures[_plain_name(with_preset(options, preset))]
-        budget = figures[f"{PLAIN}@{preset}"]
-        per_pixel = [each["matching pairs"] / each["Mpx matched"] for each in (own, budget)]
-        add(f"{preset}, time per matched pixel over plain's at the same budget", per_pixel[0] / per_pixel[1],
-            MAX_PER_PIXEL)  # fmt: skip
+        for at, other in (("pixel budget", figures[f"{PLAIN}@{preset}"]), ("input size", plain)):
+            ratio = _per_pixel(own) / _per_pixel(other)
+            add(f"{preset}, time per matched pixel over plain's at the same {at}", ratio, MAX_PER_PIXEL)
         if preset in MAX_RATIO:
-            seconds = own["matching pairs"] + once["segmenting images"]
-            add(f"{preset}, time over plain's at the same input size", seconds / plain["matching pairs"],
-                MAX_RATIO[preset])  # fmt: skip
+            for what, more in (("", 0.0), (" with segmentation", once["segmenting images"])):
+                ratio = (own["matching pairs"] + more) / plain["matching pairs"]
+                add(f"{preset}{what}, time over plain's at the same input size", ratio, MAX_RATIO[preset])
         run = once["reading inputs"] + once["segmenting images"] + own["matching pairs"]
         run += sum(own[stage] for stage in REST)
         areas = own.get("area matching", 0.0) + num_images * once["describing an image"]
         add(f"{preset}, share of area description and matching in the run", areas / run, MAX_AREA_MATCHING)
     add("segmentation, seconds an image", once["segmenting images"] / num_images, MAX_SEGMENTATION_SECONDS)
     return found
+
+
+def _per_pixel(figures: Mapping[str, float]) -> float:
+    """Seconds a megapixel."""
+    return figures["matching pairs"] / figures["Mpx matched"]
 
 
 def table(figures: Mapping[str, Mapping[str, float]], once: Mapping[str, float]) -> str:
@@ -326,7 +330,7 @@ def table(figures: Mapping[str, Mapping[str, float]], once: Mapping[str, float])
         rows.append([f"{stage}, s", *(f"{value:.2f} ({value / first:.3f})" for value in values)])
     for pixels in ("Mpx matched", "Mpx extracted"):
         rows.append([pixels, *(f"{each[pixels]:.1f}" for each in figures.values())])
-    per_pixel = [each["matching pairs"] / each["Mpx matched"] for each in figures.values()]
+    per_pixel = [_per_pixel(each) for each in figures.values()]
     rows.append(["s a Mpx (ratio)", *(f"{value:.3f} ({value / per_pixel[0]:.2f})" for value in per_pixel)])
     lines = ["| " + " | ".join(row) + " |" for row in rows]
     return "\n".join([*lines, "", ", ".join(f"{name}: {seconds:.3f} s" for name, seconds in once.items())])

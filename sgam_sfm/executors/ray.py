@@ -82,12 +82,16 @@ def connected(options: MatchOptions) -> Iterator[RayExecutor]:
         _require_room(need)
         own_device = "cpu" if device == "cpu" else str(find_device("auto"))
         use_threads(options.threads)
-        on_cpu = replace(options, device="cpu", precision="auto" if options.precision == "auto" else "full")
-        create_matcher(on_cpu)  # what is wrong with it is to be known before images are read
+        create_matcher(on_this_cpu(options))  # what is wrong with it is to be known before images are read
         yield RayExecutor(device=device, own_device=own_device, need=need)
     finally:
         if ours:
             ray.shutdown()
+
+
+def on_this_cpu(options: MatchOptions) -> MatchOptions:
+    """The options for a matcher that only the workers use, made here to see whether it can be made."""
+    return replace(options, device="cpu", precision="auto" if options.precision == "auto" else "full")
 
 
 def _connect(address: str) -> None:
