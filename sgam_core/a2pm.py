@@ -260,7 +260,7 @@ class _Points:
         self.notes: tuple[str, ...] = ()
         self._turns = 0
         self._whole: Matches | None = None
-        self._agreement: TwoViewModel | None = None
+        self._agreement: list[TwoViewModel | None] = []  # empty until it is asked for
 
     @property
     def turns(self) -> int:
@@ -270,7 +270,7 @@ class _Points:
     @turns.setter
     def turns(self, turns: int) -> None:
         if turns != self._turns:
-            self._turns, self._whole, self._agreement = turns, None, None
+            self._turns, self._whole, self._agreement = turns, None, []
 
     @property
     def whole_is_known(self) -> bool:
@@ -284,9 +284,9 @@ class _Points:
 
     def agreement(self, estimate: Estimate) -> TwoViewModel | None:
         """The geometry of the whole images, computed at the first call."""
-        if self._agreement is None:
-            self._agreement = estimate(self.whole())
-        return self._agreement
+        if not self._agreement:
+            self._agreement.append(estimate(self.whole()))
+        return self._agreement[0]
 
     def at_every_turn(self, image_size: int) -> list[Matches]:
         """Plain matches of the whole images at another size, image 1 turned by 0, 1, 2 and 3 quarters."""

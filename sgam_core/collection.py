@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -80,11 +81,11 @@ def _first_of_duplicates(matches: Matches, duplicate_px: float) -> np.ndarray:
 
 def _covered(coarse: Matches, fine: Matches, covered_px: float) -> np.ndarray:
     """Which coarse matches have a finer one near them in both images."""
-    covered = np.zeros(len(coarse), bool)
     near0 = cKDTree(fine.points0).query_ball_point(coarse.points0, covered_px * coarse.sigmas0)
-    for row, neighbours in enumerate(near0):
-        if neighbours:
-            apart = np.linalg.norm(fine.points1[neighbours] - coarse.points1[row], axis=1)
-            finer = fine.sigmas[neighbours] < coarse.sigmas[row]
-            covered[row] = bool((finer & (apart <= covered_px * coarse.sigmas1[row])).any())
+    rows = np.repeat(np.arange(len(coarse)), [len(neighbours) for neighbours in near0])
+    neighbours = np.fromiter(chain.from_iterable(near0), np.intp, len(rows))
+    apart = np.linalg.norm(fine.points1[neighbours] - coarse.points1[rows], axis=1)
+    finer = fine.sigmas[neighbours] < coarse.sigmas[rows]
+    covered = np.zeros(len(coarse), bool)
+    covered[rows[finer & (apart <= covered_px * coarse.sigmas1[rows])]] = True
     return covered

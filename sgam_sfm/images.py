@@ -313,7 +313,7 @@ def _rgb(picture: PillowImage.Image, name: str) -> UInt8[np.ndarray, "H W 3"]:
     if picture.mode in ("P", "PA"):
         picture = picture.convert("RGBA")
     try:
-        return np.array(picture.convert("RGB"))
+        return np.array(picture if picture.mode == "RGB" else picture.convert("RGB"))  # which copies any picture
     except ValueError as error:
         raise InputError(f"'{name}' has the colour mode {picture.mode}; convert it to RGB, as JPEG or PNG") from error
 

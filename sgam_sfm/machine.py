@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from sgam_core.errors import OptionError
 
 if TYPE_CHECKING:
     import torch
+
+Precision = Literal["auto", "full", "half"]
+"""Of a network's numbers: 32 bits, or 16 where they suffice."""
 
 
 def find_device(name: str, named: str = "device") -> torch.device:
@@ -29,6 +32,19 @@ def find_device(name: str, named: str = "device") -> torch.device:
         reason = str(error).splitlines()[0]
         raise OptionError(f"{named} '{name}' cannot be used ({reason}); try 'cpu', or 'cuda' with a GPU") from error
     return device
+
+
+def runs_half(precision: Precision, device: torch.device) -> bool:
+    """Whether a network that holds its results in half precision is to run so: `auto`, where that is faster.
+
+    Raises: OptionError for half precision on the CPU, where networks take longer with it.
+    """
+    if precision == "half" and device.type == "cpu":
+        raise OptionError(
+            "--precision half: on the CPU networks take one and a half times as long in half precision, or more; leave "
+            "it out, or give --device cuda with a GPU"
+        )
+    return precision == "half" or (precision == "auto" and device.type == "cuda")
 
 
 def use_threads(number: int) -> None:

@@ -54,7 +54,7 @@ class CachedMatcher:
             *_model(options, "segmenter"),
         )
         masks = (options.mask_path, *(labels if options.mask_matches else ()))
-        key = repr((options.weights, *_model(options, "matcher"), masks))
+        key = repr((options.weights, options.precision, *_model(options, "matcher"), masks))
         return CachedMatcher(create_matcher(options), inputs.digests, key, folder)
 
     def start(self) -> None:

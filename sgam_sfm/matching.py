@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,9 @@ from sgam_sfm.models import require_licence
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
 from sgam_sfm.progress import Stages
+from sgam_sfm.read_ahead import ReadAhead
 from sgam_sfm.store import PairRecord, PairStore, read_outcomes
+from sgam_sfm.supervised import crashes
 
 if TYPE_CHECKING:
     from sgam_sfm.executors import Executor, MatchingJob
@@ -36,11 +39,14 @@ def create_matcher(options: MatchOptions) -> PointMatcher:
     Raises: OptionError when its licence forbids commercial use and is not accepted, or for wrong options.
     """
     require_licence("matcher", options.matcher, options.accept_licence)
+    if options.precision != "auto" and not registry.takes("matcher", options.matcher, "precision"):
+        raise OptionError(f"--precision {options.precision}: '{options.matcher}' has no choice of it; leave it out")
     matcher: PointMatcher = registry.create(
         "matcher",
         options.matcher,
         weights=options.weights,
         device=options.device,
+        precision=options.precision,
         seed=options.seed,
         worker=WorkerCommand.of(options, "matcher", options.matcher),
     )
@@ -128,10 +134,22 @@ class CollectionMatcher:
         self._options, self._inputs, self._labels, self._point_matcher = options, inputs, labels, point_matcher
         ignored, self._masked = special_labels(options, labels)
         self._area_matcher = create_area_matcher(options, ignored)
-        self.image = lru_cache(2 * options.block_images)(self._read_image)  # those of one block
+        self.image = ReadAhead(self._read_image, 2 * options.block_images)  # those of one block
         self._description = lru_cache(_DESCRIPTIONS_IN_MEMORY)(self._describe)
 
-    def start_block(self) -> None:
+    @contextmanager
+    def block(self, pairs: Sequence[Pair]) -> Iterator[None]:
+        """What surrounds the matching of a block's pairs, in their order: caches of the point matcher start empty.
+
+        Images of the pairs that follow are read while one is matched; not once a process of this run has been ended
+        from outside, so that what a pair is told to have done was done for this pair.
+        """
+        self._reset()
+        names = () if crashes() else [name for pair in pairs for name in pair]
+        with self.image.ahead(names):
+            yield
+
+    def _reset(self) -> None:
         """Empty the point matcher's caches, where it has any."""
         reset = getattr(self._point_matcher, "reset", None)
         if reset is not None:
@@ -172,8 +190,8 @@ class CollectionMatcher:
     def _empty_caches(self) -> None:
         import torch
 
-        self.start_block()
-        self.image.cache_clear()
+        self._reset()
+        self.image.clear()
         self._description.cache_clear()
         if torch.cuda.is_available():
             torch.cuda.empty_cache()

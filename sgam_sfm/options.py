@@ -31,9 +31,10 @@ from sgam_core.options import (
     TurningOptions,
 )
 from sgam_sfm.keypoints import KeypointOptions
+from sgam_sfm.machine import Precision
 from sgam_sfm.shards import Shard
 
-Preset = Literal["default", "paper", "scannet", "outdoor"]
+Preset = Literal["default", "fast", "paper", "scannet", "outdoor"]
 _STAGES = tuple(stage.name for stage in fields(SGAMOptions))
 _CROP = tuple(option.name for option in fields(CropOptions))
 
@@ -141,6 +142,9 @@ class MatchOptions:
     """A block of pairs, the unit of work and of resume, joins up to this many images with as many others."""
     device: str = "auto"
     """auto, cpu, cuda, cuda:1, ..."""
+    precision: Precision = "auto"
+    """Of the networks of xfeat-star and loftr: half, 16 bits, faster on CUDA only; full, 32 bits; auto: half on CUDA.
+    Other matchers have no choice."""
     threads: int = 0
     """CPU threads (0: all cores)."""
     worker_timeout: float = 600.0

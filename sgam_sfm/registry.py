@@ -34,6 +34,17 @@ def require(kind: str, name: str) -> EntryPoint:
     return known[prefix]
 
 
+def takes(kind: str, name: str, setting: str) -> bool:
+    """Whether the model of that name has a choice of this setting; not known, thus yes, while a package is missing.
+
+    Raises: OptionError for an unknown name.
+    """
+    try:
+        return setting in inspect.signature(require(kind, name).load()).parameters
+    except ModuleNotFoundError:  # `create` says which
+        return True
+
+
 def create(kind: str, name: str, **settings: Any) -> Any:
     """Make the model of that name; of `prefix:rest`, `rest` is passed on as the setting `name`.
 

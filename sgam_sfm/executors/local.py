@@ -41,13 +41,13 @@ class LocalExecutor:
     ) -> Iterator[tuple[int, Sequence[PairRecord]]]:
         matcher = CollectionMatcher(job.options, job.inputs, job.labels, self.point_matcher)
         for number, block in blocks:
-            matcher.start_block()
             records = []
-            for pair in block:
-                begin(pair)
-                reason = given_up(pair)
-                records.append(failed_record(pair, reason) if reason else matcher.match(pair))
-                advance(1)
+            with matcher.block(block):
+                for pair in block:
+                    begin(pair)
+                    reason = given_up(pair)
+                    records.append(failed_record(pair, reason) if reason else matcher.match(pair))
+                    advance(1)
             yield number, records
 
     def facts(self) -> dict[str, Any]:

@@ -82,11 +82,16 @@ def connected(options: MatchOptions) -> Iterator[RayExecutor]:
         _require_room(need)
         own_device = "cpu" if device == "cpu" else str(find_device("auto"))
         use_threads(options.threads)
-        create_matcher(replace(options, device="cpu"))  # what is wrong with it is to be known before images are read
+        create_matcher(on_this_cpu(options))  # what is wrong with it is to be known before images are read
         yield RayExecutor(device=device, own_device=own_device, need=need)
     finally:
         if ours:
             ray.shutdown()
+
+
+def on_this_cpu(options: MatchOptions) -> MatchOptions:
+    """The options for a matcher that only the workers use, made here to see whether it can be made."""
+    return replace(options, device="cpu", precision="auto" if options.precision == "auto" else "full")
 
 
 def _connect(address: str) -> None:
@@ -319,8 +324,8 @@ def match_block(terms: Terms, inputs: Inputs, block: Sequence[Pair]) -> Done:
     os.environ.update(terms.environment)
     use_threads(terms.threads)
     matcher = CollectionMatcher(terms.options, inputs, terms.labels, _point_matcher(terms.options))
-    matcher.start_block()
-    records = [matcher.match(pair) for pair in block]
+    with matcher.block(block):
+        records = [matcher.match(pair) for pair in block]
     return Done(records=records, node=f"{socket.gethostname()} ({ray.get_runtime_context().get_node_id()[:8]})")
 
 

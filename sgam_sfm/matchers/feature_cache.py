@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Generic, Protocol, TypeVar, runtime_checkable
@@ -34,13 +35,15 @@ class FeatureCache(Generic[F]):
         max_bytes: bound of what is kept; the last crop is kept whatever it takes.
 
     Attributes:
-        pixels_extracted: crop pixels extracted so far, for cost reports.
+        pixels_extracted, seconds_extracting: crop pixels extracted so far, and the time that they took, for cost
+            reports; on CUDA some of it shows elsewhere.
     """
 
     def __init__(self, extract: Callable[[Sequence[Crop]], list[F]], *, batch_size: int, max_bytes: int) -> None:
         self.batch_size = batch_size
         self.max_bytes = max_bytes
         self.pixels_extracted = 0
+        self.seconds_extracting = 0.0
         self._extract = extract
         self._kept: OrderedDict[tuple, F] = OrderedDict()
 
@@ -78,7 +81,10 @@ class FeatureCache(Generic[F]):
 
     def _add(self, crops: Sequence[Crop]) -> None:
         self.pixels_extracted += sum(crop.size[0] * crop.size[1] for crop in crops)
-        for crop, features in zip(crops, self._extract(crops), strict=True):
+        start = time.perf_counter()
+        extracted = self._extract(crops)
+        self.seconds_extracting += time.perf_counter() - start
+        for crop, features in zip(crops, extracted, strict=True):
             self._kept[crop.key] = features
             while self.nbytes > self.max_bytes and len(self._kept) > 1:
                 self._kept.popitem(last=False)

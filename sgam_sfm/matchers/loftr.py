@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Crop, Matches
-from sgam_sfm.machine import find_device, out_of_memory
+from sgam_sfm.machine import Precision, find_device, out_of_memory, runs_half
 from sgam_sfm.matchers.frames import in_batches
 from sgam_sfm.matchers.masks import wanted
 from sgam_sfm.matchers.state_dicts import fill
@@ -45,7 +45,8 @@ class LoFTR:
     Args:
         weights: `outdoor` (the default) or `indoor_new`, looked for in the torch-hub cache; or a checkpoint file: a
             state dict as kornia or the authors' repository names its parameters, plain or under `state_dict`.
-        device: a torch device. On CUDA the backbone runs in half precision.
+        device: a torch device.
+        precision: of the backbone; `auto`: half on CUDA, full elsewhere.
         min_confidence: matches exceed it; in [0, 1).
         corrected_encoding: whether the weights were trained with the corrected positional encoding, as `indoor_new`
             was; None: so when the file's name contains `indoor_new` or `indoor_ds_new`, the names it is published by.
@@ -62,6 +63,7 @@ class LoFTR:
         weights: Path | None = None,
         device: str = "cpu",
         seed: int = 0,
+        precision: Precision = "auto",
         min_confidence: float = 0.2,
         corrected_encoding: bool | None = None,
         batch_pixels: int = 0,
@@ -79,7 +81,7 @@ class LoFTR:
         config["match_coarse"]["thr"] = min_confidence
         config["coarse"]["temp_bug_fix"] = corrected_encoding
         self._net = _load(path, Network(None, config)).to(self.device)
-        if self.device.type == "cuda":
+        if runs_half(precision, self.device):
             self._net.backbone = _Half(self._net.get_submodule("backbone"))
 
     @torch.inference_mode()

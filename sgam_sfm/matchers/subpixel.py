@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 from scipy.spatial import cKDTree
 
 from sgam_core.types import Crop, Matches
@@ -99,12 +99,20 @@ def refine(
     return points1, correlation.clip(-1, 1)
 
 
-def aligned(crop0: Crop, crop1: Crop, matches: Matches) -> Matches:
+def aligned(
+    crop0: Crop,
+    crop1: Crop,
+    matches: Matches,
+    grays: tuple[UInt8[np.ndarray, "h0 w0"], UInt8[np.ndarray, "h1 w1"]] | None = None,
+) -> Matches:
     """The matches with their second points moved to where the patches agree; where they do not, as they were.
 
     The scores fall by the share of the patches that does not correlate.
+
+    Args: grays: the intensities of both crops, for a caller that has kept them: see `intensities`.
     """
-    gray0, gray1 = (cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY).astype(np.float32) for crop in (crop0, crop1))
+    grays = grays or (intensities(crop0.pixels()), intensities(crop1.pixels()))
+    gray0, gray1 = (gray.astype(np.float32) for gray in grays)
     affines = local_affines(matches.points0, matches.points1)
     points1, correlations = refine(gray0, gray1, matches.points0, matches.points1, affines, strides=(1,))
     near = np.linalg.norm(points1 - matches.points1, axis=1) < MAX_SHIFT
@@ -114,6 +122,12 @@ def aligned(crop0: Crop, crop1: Crop, matches: Matches) -> Matches:
         points1=np.where(better[:, None], points1, matches.points1),
         scores=matches.scores * (1 + correlations) / 2,
     )
+
+
+def intensities(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
+    """What patches are compared by."""
+    gray: np.ndarray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    return gray
 
 
 def _smoothed(gray: np.ndarray, stride: int) -> np.ndarray:
@@ -131,4 +145,4 @@ def _patches(gray: np.ndarray, points: np.ndarray, offsets: np.ndarray) -> tuple
     )
     patches -= (patches @ _WINDOW)[:, None]
     deviation = np.sqrt(patches**2 @ _WINDOW)
-    return patches / np.maximum(deviation, 1e-6)[:, None], deviation
+    return np.divide(patches, np.maximum(deviation, 1e-6)[:, None], out=patches), deviation

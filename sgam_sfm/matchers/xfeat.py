@@ -27,12 +27,12 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sgam_core.errors import OptionError
 from sgam_core.types import Crop, Matches
-from sgam_sfm.machine import find_device
+from sgam_sfm.machine import Precision, find_device, runs_half
 from sgam_sfm.matchers.feature_cache import FeatureCache
 from sgam_sfm.matchers.masks import wanted
 from sgam_sfm.matchers.sparse import batch_size as together
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
-from sgam_sfm.matchers.subpixel import aligned
+from sgam_sfm.matchers.subpixel import aligned, intensities
 from sgam_sfm.weights import XFEAT, find_weights
 
 CELL = 8  # pixels of the network's input per cell
@@ -46,19 +46,25 @@ MIN_FEATURES = 64  # of a crop, however small
 class _Features:
     """The features of one crop, in crop pixels.
 
-    descriptors: (K, 64), not normalised. centers: (K, 2), of their cells. steps: (K, 2), size of a network pixel.
+    descriptors: (K, 64), not normalised. centers: (K, 2), of their cells. steps: (K, 2), size of a network pixel. gray:
+    (h, w), of the whole crop, which takes long to cut out of a photo again.
     """
 
     descriptors: Tensor
     centers: Tensor
     steps: Tensor
+    gray: np.ndarray
 
     @property
     def nbytes(self) -> int:
-        return self.descriptors.nbytes + self.centers.nbytes + self.steps.nbytes
+        return self.descriptors.nbytes + self.centers.nbytes + self.steps.nbytes + self.gray.nbytes
 
     def select(self, rows: Tensor) -> _Features:
-        return _Features(self.descriptors[rows], self.centers[rows], self.steps[rows])
+        return _Features(self.descriptors[rows], self.centers[rows], self.steps[rows], self.gray)
+
+
+_Cells = tuple[Tensor, Tensor, Tensor]
+"""Descriptors, centers and steps, as in `_Features`, of one scale."""
 
 
 class XFeatStar:
@@ -74,7 +80,8 @@ class XFeatStar:
 
     Args:
         weights: the model file; found by itself when omitted.
-        device: a torch device, such as `cpu` or `cuda:0`. On CUDA the network runs in half precision.
+        device: a torch device, such as `cpu` or `cuda:0`.
+        precision: of the network; `auto`: half on CUDA, full elsewhere.
         features_per_megapixel: how many cells of a crop are kept, by reliability.
         scales: the two sizes at which a crop is seen, as factors of its own.
         coarse_share: share of the features that comes from the first scale; 0 for the second scale alone.
@@ -95,6 +102,7 @@ class XFeatStar:
         weights: Path | None = None,
         device: str = "cpu",
         seed: int = 0,
+        precision: Precision = "auto",
         features_per_megapixel: int = 12_000,
         scales: tuple[float, float] = (0.6, 1.3),
         coarse_share: float = 0.1,
@@ -111,6 +119,7 @@ class XFeatStar:
         if min(scales) <= 0:
             raise OptionError(f"scales are {scales}; expected two positive factors")
         self.device = find_device(device)
+        self._half = runs_half(precision, self.device)
         self.features_per_megapixel = features_per_megapixel
         self.shares = ((scales[0], coarse_share), (scales[1], 1 - coarse_share))
         self.min_confidence = min_confidence
@@ -150,25 +159,27 @@ class XFeatStar:
 
         good = (confidences1 > self.min_confidence).cpu().numpy() & wanted(crop0, points0) & wanted(crop1, points1)
         matches = Matches(points0=points0[good], points1=points1[good], scores=scores[good])
-        return aligned(crop0, crop1, matches) if self.photometric else matches
+        return aligned(crop0, crop1, matches, (features0.gray, features1.gray)) if self.photometric else matches
 
     def _extract(self, crops: Sequence[Crop]) -> list[_Features]:
         """The features of crops of one size, which go through the network together."""
         width, height = crops[0].size
-        gray = torch.stack([torch.from_numpy(crop.pixels()).to(self.device).float().mean(-1) for crop in crops])
+        pixels = [crop.pixels() for crop in crops]
+        gray = torch.stack([torch.from_numpy(each).to(self.device).float().mean(-1) for each in pixels])
         budget = max(MIN_FEATURES, round(self.features_per_megapixel * width * height / 1e6))
         scales = [self._extract_at(scale, round(share * budget), gray, crops) for scale, share in self.shares if share]
-        return [
-            _Features(*(torch.cat([getattr(part, name) for part in parts]) for name in _Features.__slots__))
-            for parts in zip(*scales, strict=True)
-        ]
+        found = []
+        for own, parts in zip(pixels, zip(*scales, strict=True), strict=True):
+            descriptors, centers, steps = (torch.cat(of_scales) for of_scales in zip(*parts, strict=True))
+            found.append(_Features(descriptors, centers, steps, intensities(own)))
+        return found
 
-    def _extract_at(self, scale: float, count: int, gray: Tensor, crops: Sequence[Crop]) -> list[_Features]:
+    def _extract_at(self, scale: float, count: int, gray: Tensor, crops: Sequence[Crop]) -> list[_Cells]:
         """The `count` most reliable cells of each crop, seen at `scale` of its size."""
         size = crops[0].size
         width, height = (max(MULTIPLE, round(scale * side / MULTIPLE) * MULTIPLE) for side in size)
         images = interpolate(gray[:, None], (height, width), mode="bilinear", align_corners=False)
-        with torch.autocast(self.device.type, torch.float16, enabled=self.device.type == "cuda"):
+        with torch.autocast(self.device.type, torch.float16, enabled=self._half):
             maps, _, reliability = self._net(images.contiguous(memory_format=torch.channels_last))
 
         cells_y, cells_x = torch.meshgrid(*(torch.arange(n, device=self.device) for n in maps.shape[2:]), indexing="ij")
@@ -181,7 +192,7 @@ class XFeatStar:
                 best = best[torch.from_numpy(wanted(crop, centers.cpu().numpy())).to(self.device)[best]]
             best = best[:count]
             descriptors = own_map.flatten(1).T[best].contiguous()
-            found.append(_Features(descriptors, centers[best], step.expand(len(best), 2)))
+            found.append((descriptors, centers[best], step.expand(len(best), 2)))
         return found
 
     def _offsets(self, here: _Features, there: _Features) -> tuple[Tensor, Tensor]:

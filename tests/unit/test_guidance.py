@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sgam_core import SemanticAreaMatcher, SGAMOptions
+from sgam_core import SemanticAreaMatcher, SGAMOptions, a2pm
 from sgam_core.a2pm import match_described, match_whole
 from sgam_core.covisible import Frame
+from sgam_core.geometry import estimate_two_view
 from sgam_core.guidance import guided_areas
 from sgam_core.options import CropOptions, GuidanceOptions, changed
 from sgam_core.types import AreaState, Matches
@@ -85,6 +86,28 @@ def in_room(room: Room, options: SGAMOptions, names=("view03.jpg", "view04.jpg")
     images = [room.images[name] for name in names]
     described = [matcher.describe(room.images[name], room.renderings[name].labels.astype(np.int32)) for name in names]
     return match_described(*images, *described, matcher, TrueMatcher(room), options)
+
+
+def test_whole_images_that_tell_nothing_are_judged_once(room, monkeypatch):
+    """The geometry of their matches says that areas are needed, and is the pair's when there are none."""
+    asked: list[int] = []
+
+    def counted(matches, **settings):
+        asked.append(len(matches))
+        return estimate_two_view(matches, **settings)
+
+    monkeypatch.setattr(a2pm, "estimate_two_view", counted)
+    options = changed(
+        SGAMOptions(),
+        guidance__sure_matches=10_000,
+        guidance__min_gain=1e9,
+        semantic__objects__enabled=False,
+        semantic__intersections__enabled=False,
+    )
+    found = in_room(room, options)
+    assert found.fallback == "no area match"
+    assert found.two_view is not None
+    assert len(asked) == 1
 
 
 COARSE = changed(SGAMOptions(), crop__image_size=256, crop__area_size=320)

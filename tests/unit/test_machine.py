@@ -1,8 +1,10 @@
 """What a run uses of the machine."""
 
+import pytest
 import torch
 
-from sgam_sfm.machine import use_threads
+from sgam_core.errors import OptionError
+from sgam_sfm.machine import runs_half, use_threads
 
 
 def test_all_threads_are_used_again_after_a_run_with_one():
@@ -12,3 +14,22 @@ def test_all_threads_are_used_again_after_a_run_with_one():
     assert torch.get_num_threads() == 1
     use_threads(0)
     assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize(
+    ("precision", "device", "expected"),
+    [
+        ("auto", "cpu", False),
+        ("auto", "cuda", True),
+        ("full", "cpu", False),
+        ("full", "cuda", False),
+        ("half", "cuda", True),
+    ],
+)
+def test_half_precision_is_for_cuda(precision, device, expected):
+    assert runs_half(precision, torch.device(device)) is expected
+
+
+def test_half_precision_on_the_cpu_is_refused():
+    with pytest.raises(OptionError, match=r"^--precision half: on the CPU networks take .* leave it out, or give "):
+        runs_half("half", torch.device("cpu"))

@@ -2,11 +2,13 @@
 
 import json
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from sgam_core import PRESETS
 from sgam_core.errors import OptionError
-from sgam_sfm.options import VERSION, MatchOptions, as_json, fingerprint, starting_options
+from sgam_sfm.options import VERSION, MatchOptions, Preset, as_json, fingerprint, starting_options
 
 
 def written(tmp_path: Path, content: object, name: str = "c.json") -> Path:
@@ -27,7 +29,7 @@ def written(tmp_path: Path, content: object, name: str = "c.json") -> Path:
             {"mapper": "colmap"},
             "option 'mapper' is 'colmap': Input should be 'incremental', 'global' or 'hierarchical'",
         ),
-        ({"preset": "papr"}, "preset 'papr' is unknown; known: default, paper"),
+        ({"preset": "papr"}, "preset 'papr' is unknown; known: default, fast, paper"),
         ([1, 2], "holds a list; expected options by name"),
         ("{", "cannot be used ("),
     ],
@@ -77,9 +79,18 @@ def test_written_options_read_back_and_have_absolute_paths(tmp_path, monkeypatch
     assert as_json(read) == content
 
 
+def test_presets_are_those_that_can_be_named():
+    assert set(get_args(Preset)) == set(PRESETS)
+    fast, default = PRESETS["fast"], PRESETS["default"]
+    assert fast.crop.image_size == default.crop.image_size  # what its time is compared at
+    assert fast.crop.max_crop_pixels < default.crop.max_crop_pixels / 2
+    assert fast.geometry == default.geometry
+
+
 def test_results_follow_from_images_not_from_where_they_are(tmp_path):
     here = MatchOptions(images=Path("a"), output=Path("out"), verbose=True)
     there = MatchOptions(images=Path("b"), output=Path("other"), threads=3)
     assert fingerprint(here, images={"x": "1"}) == fingerprint(there, images={"x": "1"})
     assert fingerprint(here, images={"x": "1"}) != fingerprint(here, images={"x": "2"})
     assert fingerprint(here) != fingerprint(MatchOptions(images=Path("a"), output=Path("out"), seed=1))
+    assert fingerprint(here) != fingerprint(MatchOptions(images=Path("a"), output=Path("out"), precision="full"))

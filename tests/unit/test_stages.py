@@ -1,5 +1,7 @@
 """GP, GR and GMC on areas of exact two-view scenes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -229,6 +231,26 @@ def test_merging_keeps_the_finer_of_duplicates_and_drops_coarse_matches_on_cover
     # (20, 10) lies within 8 x 3 px of the finer (10.5, 10) in both images; (10, 10) does so in image 0 only.
     np.testing.assert_array_equal(merged.points0, [[10.5, 10], [40, 40], [200, 200], [10, 10]])
     np.testing.assert_array_equal(merged.area_index, [1, 0, -1, -1])
+
+
+def test_coarse_matches_on_covered_ground_are_found_as_one_by_one():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 100, (2, 300, 2))
+    fine = replace(matches(*points[:, :150], 1.0, 0), sigmas1=rng.choice([1.0, 3.0], 150).astype(np.float32))
+    coarse = matches(*(points[:, 50:250] + rng.normal(0, 4, (2, 200, 2))), 2.0, -1)
+    expected = [
+        any(
+            max(fine.sigmas0[row], fine.sigmas1[row]) < 2.0
+            and np.linalg.norm(fine.points0[row] - point0) <= 3 * 2.0
+            and np.linalg.norm(fine.points1[row] - point1) <= 3 * 2.0
+            for row in range(len(fine))
+        )
+        for point0, point1 in zip(coarse.points0, coarse.points1, strict=True)
+    ]
+    merged = merge([fine], coarse, CollectionOptions(covered_px=3.0, duplicate_px=0.0))
+    left = merged.points0[merged.area_index == -1]
+    assert 0 < sum(expected) < len(coarse)
+    np.testing.assert_array_equal(left, coarse.points0[~np.array(expected)])
 
 
 def test_merging_nothing_gives_nothing():

@@ -6,6 +6,8 @@ from hypothesis import strategies as st
 
 from sgam_core.errors import OptionError, WeightsError
 from sgam_core.types import Box, Crop
+from sgam_sfm.matchers import xfeat
+from sgam_sfm.matchers.subpixel import aligned
 from sgam_sfm.matchers.xfeat import XFeatStar, _mutual_nearest
 from tests.textures import similarity, transfer, view, whole
 
@@ -18,6 +20,20 @@ def matcher():
 @pytest.fixture(scope="module")
 def crop():
     return whole(view(np.eye(3), (160, 128)), "texture")
+
+
+def test_patches_are_those_of_the_crops_whether_they_were_kept_or_not(monkeypatch):
+    first = Crop(
+        image=whole(view(np.eye(3), (320, 256)), "large").image, window=Box(x0=8, y0=0, x1=312, y1=256), size=(152, 128)
+    )
+    second = whole(view(similarity(0.5, 3.0, (1.2, 0.7), (80.0, 64.0)), (160, 128)), "small")
+    matcher = XFeatStar()
+    (found,) = matcher.match([(first, second)])
+    monkeypatch.setattr(xfeat, "aligned", lambda crop0, crop1, matches, _: aligned(crop0, crop1, matches))
+    (again,) = matcher.match([(first, second)])
+    assert len(found) > 20
+    for name in ("points0", "points1", "scores"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(again, name))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,119 @@
+"""Pairs are matched alike whether images are read ahead or not, and whatever becomes of the images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from sgam_core import Crop, Matches
+from sgam_sfm import matching, read_ahead, supervised
+from sgam_sfm.executors import MatchingJob
+from sgam_sfm.executors.local import LocalExecutor
+from sgam_sfm.images import read_image
+from sgam_sfm.inputs import Inputs, read_inputs
+from sgam_sfm.options import MatchOptions
+from sgam_sfm.pairs import blocks
+from sgam_sfm.progress import Stages
+from sgam_sfm.store import PairRecord
+
+NUM_IMAGES = 7
+
+
+@dataclass
+class MeanMatcher:
+    """One match a pair, at what the crops' means are, so that no image can be taken for another one."""
+
+    calls: list[tuple[str, str]] = field(default_factory=list)
+
+    def match(self, pairs: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
+        self.calls += [(crop0.image.name, crop1.image.name) for crop0, crop1 in pairs]
+        means = [[crop.pixels()[..., :2].mean((0, 1)) for crop in pair] for pair in pairs]
+        return [Matches(points0=a[None], points1=b[None], scores=np.ones(1)) for a, b in means]
+
+
+@pytest.fixture
+def options(tmp_path) -> MatchOptions:
+    rng = np.random.default_rng(0)
+    (tmp_path / "images").mkdir()
+    for number in range(NUM_IMAGES):
+        pixels = rng.integers(0, 200, (24, 32, 3), np.uint8) + np.uint8(5 * number)
+        PIL.Image.fromarray(pixels).save(tmp_path / "images" / f"{number}.png")
+    return MatchOptions(images=tmp_path / "images", output=tmp_path / "out", area_matcher="none", block_images=2)
+
+
+@pytest.fixture
+def inputs(options) -> Inputs:
+    return read_inputs(options, Stages(quiet=True))
+
+
+def matched(options: MatchOptions, inputs: Inputs) -> dict[tuple[str, str], tuple[list, str]]:
+    """What each pair's record holds."""
+    executor = LocalExecutor(device="cpu", point_matcher=MeanMatcher())
+    job = MatchingJob(options=options, inputs=inputs, labels=None)
+    numbered = list(enumerate(blocks(inputs.pairs.pairs, options.block_images)))
+    records = [r for _, records in executor.run(job, numbered, lambda _: None, lambda _: None) for r in records]
+    assert {record.pair for record in records} == set(combinations(sorted(inputs.images), 2))
+    return {record.pair: (content(record), record.error) for record in records}
+
+
+def content(record: PairRecord) -> list:
+    result = record.result
+    return [] if result is None else [result.matches.points0.tolist(), result.matches.points1.tolist()]
+
+
+def test_results_do_not_depend_on_reading_ahead(options, inputs, monkeypatch):
+    ahead = matched(options, inputs)
+    monkeypatch.setattr(read_ahead, "_AHEAD", 0)
+    assert matched(options, inputs) == ahead
+    assert len({repr(points) for points, _ in ahead.values()}) == NUM_IMAGES * (NUM_IMAGES - 1) // 2
+
+
+def test_an_image_that_is_gone_or_broken_is_the_reason_of_its_pairs_alone(options, inputs, monkeypatch):
+    (options.images / "3.png").unlink()
+    (options.images / "5.png").write_bytes(b"\x89PNG no more")
+    ahead = matched(options, inputs)
+    monkeypatch.setattr(read_ahead, "_AHEAD", 0)
+    assert matched(options, inputs) == ahead
+    for pair, (_, error) in ahead.items():
+        assert bool(error) == bool({"3.png", "5.png"} & {*pair}), pair
+    assert ahead["2.png", "3.png"][1].startswith(f"image '{options.images / '3.png'}' cannot be read")
+    assert "'5.png' cannot be decoded" in ahead["4.png", "5.png"][1]
+
+
+def test_memory_that_does_not_suffice_for_an_image_once(options, inputs, monkeypatch):
+    """Whoever reads it: the pair is tried again with empty caches."""
+    expected = matched(options, inputs)
+    tries: list[Path] = []
+
+    def read(file):
+        tries.append(file.path)
+        if tries.count(file.path) == 1 and file.name in ("1.png", "4.png"):
+            raise MemoryError("Unable to allocate 9 GiB")
+        return read_image(file)
+
+    monkeypatch.setattr(matching, "read_image", read)
+    assert matched(options, inputs) == expected
+
+
+def test_nothing_is_read_ahead_once_a_process_was_ended_from_outside(options, inputs, monkeypatch):
+    """A pair is judged by what ends its process, and that must not be the image of another pair."""
+    told: list[tuple[str, int]] = []
+
+    def read(file):
+        told.append((file.name, len(matcher.calls)))
+        return read_image(file)
+
+    matcher = MeanMatcher()
+    monkeypatch.setattr(matching, "read_image", read)
+    monkeypatch.setattr(supervised._state, "crashes", (supervised.Crash(signal="SIGKILL"),))
+    job = MatchingJob(options=options, inputs=inputs, labels=None)
+    order = (("0.png", "2.png"), ("0.png", "3.png"), ("1.png", "2.png"))
+    executor = LocalExecutor(device="cpu", point_matcher=matcher)
+    list(executor.run(job, [(0, order)], lambda _: None, lambda _: None))
+    assert told == [("0.png", 0), ("2.png", 0), ("3.png", 1), ("1.png", 2)]
