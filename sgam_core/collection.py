@@ -12,6 +12,8 @@ from sgam_core.geometry import residuals
 from sgam_core.options import CollectionOptions
 from sgam_core.types import Box, Matches, TwoViewModel
 
+_TOGETHER = 1024  # matches whose neighbours are in memory together
+
 
 def coverage(boxes: Sequence[Box], width: int, height: int) -> float:
     """Share of an image inside the union of the boxes."""
@@ -81,11 +83,14 @@ def _first_of_duplicates(matches: Matches, duplicate_px: float) -> np.ndarray:
 
 def _covered(coarse: Matches, fine: Matches, covered_px: float) -> np.ndarray:
     """Which coarse matches have a finer one near them in both images."""
-    near0 = cKDTree(fine.points0).query_ball_point(coarse.points0, covered_px * coarse.sigmas0)
-    rows = np.repeat(np.arange(len(coarse)), [len(neighbours) for neighbours in near0])
-    neighbours = np.fromiter(chain.from_iterable(near0), np.intp, len(rows))
-    apart = np.linalg.norm(fine.points1[neighbours] - coarse.points1[rows], axis=1)
-    finer = fine.sigmas[neighbours] < coarse.sigmas[rows]
     covered = np.zeros(len(coarse), bool)
-    covered[rows[finer & (apart <= covered_px * coarse.sigmas1[rows])]] = True
+    tree, sigmas = cKDTree(fine.points0), fine.sigmas
+    for start in range(0, len(coarse), _TOGETHER):
+        part = coarse.select(np.arange(start, min(start + _TOGETHER, len(coarse))))
+        near0 = tree.query_ball_point(part.points0, covered_px * part.sigmas0)
+        rows = np.repeat(np.arange(len(part)), [len(neighbours) for neighbours in near0])
+        neighbours = np.fromiter(chain.from_iterable(near0), np.intp, len(rows))
+        apart = np.linalg.norm(fine.points1[neighbours] - part.points1[rows], axis=1)
+        near = (sigmas[neighbours] < part.sigmas[rows]) & (apart <= covered_px * part.sigmas1[rows])
+        covered[start + rows[near]] = True
     return covered

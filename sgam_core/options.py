@@ -346,7 +346,7 @@ FAST = changed(
     guidance__sure_matches=60,
     guidance__min_gain=1.2,
 )
-"""About half more time than whole images take: few areas where whole images do not agree, and a second round only where
+"""At most half more time than whole images take: few areas where whole images do not agree, and a second round only where
 it is a fifth finer."""
 
 PRESETS: Mapping[str, SGAMOptions] = MappingProxyType(

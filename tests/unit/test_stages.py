@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sgam_core import collection
 from sgam_core.collection import collect, coverage, merge
 from sgam_core.geometry import estimate_two_view
 from sgam_core.options import CollectionOptions, GeometryOptions, PredictionOptions, RejectionOptions
@@ -233,7 +234,9 @@ def test_merging_keeps_the_finer_of_duplicates_and_drops_coarse_matches_on_cover
     np.testing.assert_array_equal(merged.area_index, [1, 0, -1, -1])
 
 
-def test_coarse_matches_on_covered_ground_are_found_as_one_by_one():
+@pytest.mark.parametrize("together", [7, 1024])
+def test_coarse_matches_on_covered_ground_are_found_as_one_by_one(monkeypatch, together):
+    monkeypatch.setattr(collection, "_TOGETHER", together)
     rng = np.random.default_rng(0)
     points = rng.uniform(0, 100, (2, 300, 2))
     fine = replace(matches(*points[:, :150], 1.0, 0), sigmas1=rng.choice([1.0, 3.0], 150).astype(np.float32))
