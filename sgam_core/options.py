@@ -346,8 +346,8 @@ FAST = changed(
     guidance__sure_matches=60,
     guidance__min_gain=1.2,
 )
-"""At most half more time than whole images take: few areas where whole images do not agree, and a second round only where
-it is a fifth finer."""
+"""At most half more time than whole images take: few areas, where whole images do not agree, and a second round only
+where it is a fifth finer."""
 
 PRESETS: Mapping[str, SGAMOptions] = MappingProxyType(
     {"default": SGAMOptions(), "fast": FAST, "paper": PAPER, "scannet": SCANNET, "outdoor": OUTDOOR}
