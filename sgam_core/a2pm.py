@@ -85,8 +85,9 @@ def match_described(
     clock.lap("whole images")
     if first is None:
         putative = area_matcher.match(description0, description1, points.whole)
-        if guides and options.guidance.max_chance < 1:
+        if guides:  # here areas are to find evidence: a finer look follows
             putative = supported(putative, points.whole(), options.guidance.max_chance)
+            points.options = _evidence_crops(options)
         clock.lap("area matching")
         first = _by_areas(putative, points, estimate, options, clock)
     found = _guided(first, points, estimate, options) or first if guides else first
@@ -142,6 +143,13 @@ def _turns(points: _Points, estimate: Estimate, options: SGAMOptions) -> int:
     best = int(np.argmax(inliers))
     enough = max(options.turning.min_inliers, options.turning.min_lead * inliers[0])
     return best if inliers[best] >= enough else 0
+
+
+def _evidence_crops(options: SGAMOptions) -> CropOptions:
+    """Crops of the areas that are matched before the guided ones."""
+    crop, guidance = options.crop, options.guidance
+    budget = min(crop.max_crop_pixels or guidance.evidence_pixels, guidance.evidence_pixels)
+    return replace(crop, area_size=min(crop.area_size, guidance.evidence_size), max_crop_pixels=budget)
 
 
 def _by_areas(

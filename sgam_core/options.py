@@ -252,6 +252,10 @@ class GuidanceOptions(_Checked):
     max_chance: float = 0.01
     """Where they do not agree, area pairs are matched that whole-image matches join more often than chance: the largest
     probability of chance (1: all area pairs)."""
+    evidence_size: int = 512
+    """Long side of these areas' crops at the matcher, pixels, where area_size is larger."""
+    evidence_pixels: int = 1_500_000
+    """Their pixels per pair, both sides together, where max_crop_pixels is more; those with most support come first."""
     min_matches: int = 20
     """Fewest consistent matches for a window."""
     quantile: float = 0.02
