@@ -77,8 +77,9 @@ class TimedMatcher:
         found = self.matcher.match(pairs)
         whole = all(_is_whole(crop.image, crop) for pair in pairs for crop in pair)
         extracting = self._extracting - before
-        self.seconds["extracting"] += extracting
-        self.seconds["matching whole images" if whole else "matching areas"] += time.perf_counter() - start - extracting
+        rest = "matching whole images" if whole else "matching areas"
+        self.seconds["extracting"] += extracting  # type: ignore[assignment]  # typeshed's counters count whole things
+        self.seconds[rest] += time.perf_counter() - start - extracting  # type: ignore[assignment]
         return found
 
     @property

@@ -32,12 +32,12 @@ import pycolmap
 from scipy.spatial import cKDTree
 
 from sgam_core import Area, AreaMatch, Box, Matches, PairResult, TwoViewModel
-from sgam_core.geometry import GeometryOptions
+from sgam_core.options import GeometryOptions
 from sgam_sfm.assembly import merged_records
 from sgam_sfm.database import write_database
 from sgam_sfm.files import write_json
 from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
-from sgam_sfm.keypoints import KeypointOptions
+from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions
 from sgam_sfm.machine import peak_memory_mb
 from sgam_sfm.pairs import Pair, blocks
 from sgam_sfm.store import PairRecord, PairStore
@@ -295,7 +295,7 @@ def merge_stage(scene: Scene, folder: Path, hloc: bool) -> dict:
     figures = {}
     clock = Clock(folder)
     with merged_records(
-        store.read_all(num_blocks), KeypointOptions(), GeometryOptions().max_residual, folder
+        store.read_all(num_blocks), KeypointOptions(), GeometryOptions().max_residual, folder, folder
     ) as merged:
         figures["merge"] = clock.figures(merged.num_raw) | quality(merged)
         clock = Clock(folder)
@@ -310,7 +310,7 @@ def merge_stage(scene: Scene, folder: Path, hloc: bool) -> dict:
     return figures
 
 
-def quality(merged) -> dict:
+def quality(merged: CollectionKeypoints) -> dict:
     """What merging made of the matches."""
     return {
         "keypoints": sum(map(len, merged.keypoints.values())),
