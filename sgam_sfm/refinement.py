@@ -16,10 +16,11 @@ import pycolmap
 
 
 def refine(model: pycolmap.Reconstruction, pipeline: pycolmap.IncrementalPipelineOptions) -> None:
-    """Drop the points that two images see, and adjust poses and cameras to the others, in place.
+    """Drop the points that two images see, and adjust poses to the others, in place.
 
-    Images that see too few others keep theirs. The loss is Cauchy's at the median error of the points; what else bundle
-    adjustment needs, the cameras that are held fixed too, is the mapper's own. Runs in the child of `sgam_sfm.mapping`.
+    Images that see too few others keep theirs. The loss is Cauchy's at the median error of the points; the other options
+    of bundle adjustment are the mapper's own. Cameras stay as the mapper left them: on some paths around a thing they
+    can change a lot and fit as well. Runs in the child of `sgam_sfm.mapping`.
     """
     images = {point_id: {seen.image_id for seen in point.track.elements} for point_id, point in model.points3D.items()}
     pairwise = {point_id: seen for point_id, seen in images.items() if len(seen) < 3}
@@ -37,7 +38,7 @@ def refine(model: pycolmap.Reconstruction, pipeline: pycolmap.IncrementalPipelin
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
-    for camera_id in pipeline.constant_cameras:
+    for camera_id in model.cameras:
         config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()

@@ -18,9 +18,6 @@ from tests.paths import DATA
 from tests.room import Room, small_room
 from tests.tutorials import DOCS, follow
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # read when torch is imported: processes side by side have a core each
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 # Read when huggingface_hub is imported: tests take no model from the network, and do not wait for one.
 os.environ["HF_HUB_OFFLINE"] = "1"
 
