@@ -162,7 +162,7 @@ class Crop:
         return self.size[::-1] if self.turns % 2 else self.size
 
     def _turn(self, array: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(np.rot90(array, self.turns))
+        return np.rot90(array, self.turns).copy() if self.turns else array
 
     def _cut(self, array: np.ndarray) -> np.ndarray:
         w = self.window

@@ -345,7 +345,10 @@ def _last_words(log_path: Path, start: int) -> str:
     """The line of the log since byte `start` that tells most: the last error, or else the last line."""
     with log_path.open("rb") as log:
         log.seek(start)
-        lines = [line.strip() for line in log.read().decode("utf-8", "replace").splitlines()]
+        # glog's handler of signals may write into a line that is not ended yet
+        lines = [
+            line.partition("*** Aborted")[0].strip() for line in log.read().decode("utf-8", "replace").splitlines()
+        ]
     lines = [line for line in lines if line and not _TRACE_LINE.match(line)]
     errors = [line for line in lines if _ERROR_LINE.match(line)]
     return (errors or lines or ["it left no message"])[-1]

@@ -96,6 +96,7 @@ def test_a_turned_crop_is_the_crop_turned_anticlockwise(width, height, long_side
     turned = crop.turned(turns).turned(more)
     np.testing.assert_array_equal(turned.pixels(), np.rot90(crop.pixels(), turns + more))
     np.testing.assert_array_equal(turned.mask(), np.rot90(crop.mask(), turns + more))
+    assert min(turned.pixels().strides) > 0  # torch takes no others, and numpy calls some of one pixel contiguous
     assert turned.size == turned.pixels().shape[1::-1]
     assert turned.scale == crop.scale
     assert (turned.key == crop.key) == ((turns + more) % 4 == 0)
