@@ -436,11 +436,11 @@ def _map(job: dict[str, Any], send: Send) -> dict[str, Any]:
         f"best with {max(verified, default=0)} inliers; try pairs that overlap more (`sgam-sfm show OUT` draws them), "
         "a larger --image-size, or another --matcher"
     )
-    if options.mapper == "triangulate" and not models[0].num_points3D():
-        models, reason = [], f"COLMAP triangulated no point with the known poses from {len(verified)} verified pairs"
     if options.mapper != "triangulate":
         for model in models:
             refine(model, _incremental_options(options, fixed))
+    elif not models[0].num_points3D():
+        models, reason = [], f"COLMAP triangulated no point with the known poses from {len(verified)} verified pairs"
     order = sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     summaries = []
     for number, model in enumerate(order):

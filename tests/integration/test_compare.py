@@ -78,11 +78,9 @@ def test_every_method_has_its_figures_and_its_price(compared):
 
 
 def test_one_seed_gives_one_result_but_for_times(folder, compared, tmp_path):
-    again = [METHODS[0], METHODS[1], METHODS[-1]]
-    assert cli.run(["compare", *common(folder, tmp_path / "out"), "--no-report", "--methods", *again]) == DONE
+    assert cli.run(["compare", *common(folder, tmp_path / "out"), "--no-report", "--methods", *METHODS]) == DONE
     assert not (tmp_path / "out" / "report.html").exists()
-    before = without_times(content_of(compared))["methods"]
-    assert without_times(content_of(tmp_path / "out"))["methods"] == [before[0], before[1], before[-1]]
+    assert without_times(content_of(tmp_path / "out")) == without_times(content_of(compared))
 
 
 def test_started_again_it_runs_nothing_that_is_there(folder, compared):
