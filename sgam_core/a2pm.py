@@ -16,6 +16,7 @@ from sgam_core.covisible import Frame
 from sgam_core.crops import area_crop, box_crop, whole_crop
 from sgam_core.geometry import estimate_two_view, residuals
 from sgam_core.guidance import guided_areas
+from sgam_core.looks import Look, best_look
 from sgam_core.options import CropOptions, GuidanceOptions, SGAMOptions
 from sgam_core.prediction import Estimate, MatchedArea, predict
 from sgam_core.protocols import AreaMatcher, PointMatcher
@@ -68,8 +69,9 @@ def match_described(
 ) -> PairResult:
     """The whole algorithm for two images whose areas have been described: SAM, PM, GP, GR, GMC, and guided areas.
 
-    Where the area matcher has an attribute `guides` that is true, photos taken sideways are turned first, and guided
-    areas follow. Crops are those of `area_crop`, unless it has a method `crop(image, box, options)` of its own.
+    Where the area matcher has an attribute `guides` that is true, photos taken sideways are turned first, those taken
+    from near are made smaller, and guided areas follow. Crops are those of `area_crop`, unless it has a method
+    `crop(image, box, options)` of its own.
     """
     points = _Points(image0, image1, point_matcher, options.crop, getattr(area_matcher, "crop", area_crop))
     estimate = partial(
@@ -77,33 +79,44 @@ def match_described(
     )
     clock = _Clock(points)
 
+    plain = points.look
     guides = getattr(area_matcher, "guides", False)
-    if guides and options.turning.enabled:
-        points.turns = _turns(points, estimate, options)
+    if guides:
+        points.look = best_look(
+            plain,
+            agrees=lambda look: _agree(points.model(look, estimate), options.guidance),
+            inliers=partial(points.inliers, estimate=estimate),
+            turning=options.turning,
+            zoom=options.zoom,
+        )
     guides = guides and options.guidance.enabled
-    first = _plain(points, estimate, options) if guides else None
+    found = _plain(points, estimate, options) if guides else None
     clock.lap("whole images")
-    if first is None:
+    if found is None:
+        crop = options.crop
         putative = area_matcher.match(description0, description1, points.whole)
         if guides:  # here areas are to find evidence: a finer look follows
             putative = supported(putative, points.whole(), options.guidance.max_chance)
-            points.options = _evidence_crops(options)
+            crop = _evidence_crops(options)
         clock.lap("area matching")
-        first = _by_areas(putative, points, estimate, options, clock)
-    found = _guided(first, points, estimate, options) or first if guides else first
+        found = _by_areas(putative, crop, points, estimate, options, clock)
+    if guides and not found.final:
+        found = _guided(found, points, estimate, options) or found
     clock.lap("guided areas")
     coverage0, coverage1 = _coverages(found.areas, points)
+    crop0, crop1 = points.whole_crops(plain)
     return PairResult(
         matches=found.matches,
         areas=tuple(area.area for area in found.areas),
         two_view=found.model,
         coverage0=coverage0,
         coverage1=coverage1,
-        whole_scale0=whole_crop(image0, options.crop).scale,
-        whole_scale1=whole_crop(image1, options.crop).scale,
+        whole_scale0=crop0.scale,
+        whole_scale1=crop1.scale,
         fallback=found.fallback,
         notes=found.notes + points.notes,
-        turns=points.turns,
+        turns=points.look.turns,
+        zoom=points.look.size_ratio / plain.size_ratio,
         pixels_matched=points.pixels,
         seconds=clock.seconds,
     )
@@ -111,20 +124,28 @@ def match_described(
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class _Found:
-    """What a round of matching found. areas: with their states; matches name them by their row."""
+    """What a round of matching found.
+
+    areas: with their states; matches name them by their row. final: no finer round is worth its while.
+    """
 
     matches: Matches
     model: TwoViewModel | None
     areas: tuple[MatchedArea, ...] = ()
     fallback: str = ""
     notes: tuple[str, ...] = ()
+    final: bool = False
 
 
 def _plain(points: _Points, estimate: Estimate, options: SGAMOptions) -> _Found | None:
-    """The whole images, where they agree so well that areas have nothing to add but resolution."""
-    if not _agree(model := points.agreement(estimate), options.guidance):
-        return None
-    return _Found(matches=points.whole(), model=model, fallback="whole images agree, and crops would be no finer")
+    """The whole images, where they agree so well or so little that areas have nothing to add; None elsewhere."""
+    model = points.agreement(estimate)
+    found = partial(_Found, matches=points.whole(), model=model)
+    if _agree(model, options.guidance):
+        return found(fallback="whole images agree, and crops would be no finer")
+    if (model.inlier_ratio if model else 0.0) < options.guidance.min_inlier_ratio:
+        return found(fallback="whole images do not agree", final=True)
+    return None
 
 
 def _agree(model: TwoViewModel | None, options: GuidanceOptions) -> bool:
@@ -132,17 +153,6 @@ def _agree(model: TwoViewModel | None, options: GuidanceOptions) -> bool:
     if model is None or not options.sure_matches:
         return False
     return model.num_inliers >= options.sure_matches and model.inlier_ratio >= options.sure_inlier_ratio
-
-
-def _turns(points: _Points, estimate: Estimate, options: SGAMOptions) -> int:
-    """The quarter turns of image 1 by which small whole images agree clearly better than as they are; 0 for none."""
-    if _agree(points.agreement(estimate), options.guidance):
-        return 0
-    models = [estimate(matches) for matches in points.at_every_turn(options.turning.image_size)]
-    inliers = [0 if model is None else model.num_inliers for model in models]
-    best = int(np.argmax(inliers))
-    enough = max(options.turning.min_inliers, options.turning.min_lead * inliers[0])
-    return best if inliers[best] >= enough else 0
 
 
 def _evidence_crops(options: SGAMOptions) -> CropOptions:
@@ -153,10 +163,15 @@ def _evidence_crops(options: SGAMOptions) -> CropOptions:
 
 
 def _by_areas(
-    putative: PutativeAreas, points: _Points, estimate: Estimate, options: SGAMOptions, clock: _Clock
+    putative: PutativeAreas,
+    crop: CropOptions,
+    points: _Points,
+    estimate: Estimate,
+    options: SGAMOptions,
+    clock: _Clock,
 ) -> _Found:
     """The paper's algorithm after SAM: PM, GP, GR, GMC."""
-    confident, doubtful = points.inside(putative, options.prediction.max_candidates)
+    confident, doubtful = points.inside(putative, crop, options.prediction.max_candidates)
     if options.collection.min_coverage >= 1:
         points.whole()  # GMC asks for them in any case, and GR judges better with them
     clock.lap("crops")
@@ -263,56 +278,64 @@ class _Points:
         area_crop: Callable[[Image, Box, CropOptions], Crop],
     ) -> None:
         self.images, self.matcher, self.options, self.area_crop = (image0, image1), matcher, options, area_crop
+        size0, size1 = (min(options.image_size, max(image.width, image.height)) for image in self.images)
+        self.look = Look(sizes=(size0, size1))
         self.pixels = self.pixels_of_areas = 0
         self.seconds = 0.0
         self.notes: tuple[str, ...] = ()
-        self._turns = 0
-        self._whole: Matches | None = None
-        self._agreement: list[TwoViewModel | None] = []  # empty until it is asked for
-
-    @property
-    def turns(self) -> int:
-        """Quarter turns anticlockwise by which the matcher sees image 1."""
-        return self._turns
-
-    @turns.setter
-    def turns(self, turns: int) -> None:
-        if turns != self._turns:
-            self._turns, self._whole, self._agreement = turns, None, []
+        self._seen: dict[Look, Matches] = {}
+        self._models: dict[Look, TwoViewModel | None] = {}
 
     @property
     def whole_is_known(self) -> bool:
-        return self._whole is not None
+        return self.look in self._seen
 
     def whole(self) -> Matches:
-        """Plain matches of the whole images, computed at the first call."""
-        if self._whole is None:
-            self._whole = self._match([self._whole_crops(self.options.image_size)])[0]
-        return self._whole
+        """Plain matches of the whole images."""
+        self._see([self.look])
+        return self._seen[self.look]
 
     def agreement(self, estimate: Estimate) -> TwoViewModel | None:
-        """The geometry of the whole images, computed at the first call."""
-        if not self._agreement:
-            self._agreement.append(estimate(self.whole()))
-        return self._agreement[0]
+        """The geometry of the whole images."""
+        return self.model(self.look, estimate)
 
-    def at_every_turn(self, image_size: int) -> list[Matches]:
-        """Plain matches of the whole images at another size, image 1 turned by 0, 1, 2 and 3 quarters."""
-        crop0, crop1 = self._whole_crops(image_size)
-        return self._match([(crop0, crop1.turned(turns)) for turns in range(4)])
+    def inliers(self, looks: Sequence[Look], estimate: Estimate) -> list[int]:
+        """How many plain matches of the whole images are consistent, seen in several ways."""
+        self._see(looks)
+        models = [self.model(look, estimate) for look in looks]
+        return [0 if model is None else model.num_inliers for model in models]
 
-    def _whole_crops(self, image_size: int) -> tuple[Crop, Crop]:
-        options = replace(self.options, image_size=image_size)
-        crop0, crop1 = (whole_crop(image, options) for image in self.images)
-        return crop0, crop1
+    def whole_crops(self, look: Look) -> tuple[Crop, Crop]:
+        """What the matcher sees."""
+        crop0, crop1 = (
+            whole_crop(image, replace(self.options, image_size=size))
+            for image, size in zip(self.images, look.sizes, strict=True)
+        )
+        return crop0, crop1.turned(look.turns)
 
-    def inside(self, putative: PutativeAreas, max_candidates: int) -> tuple[list[MatchedArea], list[list[MatchedArea]]]:
+    def _see(self, looks: Sequence[Look]) -> None:
+        """Match whole images, together, in those ways in which they have not been matched yet."""
+        missing = [look for look in looks if look not in self._seen]
+        self._seen |= zip(missing, self._match([self.whole_crops(look) for look in missing]), strict=True)
+
+    def model(self, look: Look, estimate: Estimate) -> TwoViewModel | None:
+        """The geometry of the whole images, seen in some way."""
+        if look not in self._models:
+            self._see([look])
+            self._models[look] = estimate(self._seen[look])
+        return self._models[look]
+
+    def inside(
+        self, putative: PutativeAreas, options: CropOptions, max_candidates: int
+    ) -> tuple[list[MatchedArea], list[list[MatchedArea]]]:
         """Point matches inside all confident areas and the doubtful candidates that the limits allow."""
         limited = _limit_candidates(putative.doubtful, max_candidates)
         planned = [*putative.confident, *(candidate for group in limited for candidate in group)]
-        (image0, image1), crop, options = self.images, self.area_crop, self.options
-        crops = [(crop(image0, a.area0.box, options), crop(image1, a.area1.box, options)) for a in planned]
-        chosen = self._within_budget(planned, crops)
+        (image0, image1), crop, turns = self.images, self.area_crop, self.look.turns
+        crops = [
+            (crop(image0, a.area0.box, options), crop(image1, a.area1.box, options).turned(turns)) for a in planned
+        ]
+        chosen = self._within_budget(planned, crops, options.max_crop_pixels)
         found = dict(zip(chosen, self._match([crops[k] for k in chosen]), strict=True))
         areas = iter([self._matched(area, crops[k], found.get(k)) for k, area in enumerate(planned)])
         confident = [next(areas) for _ in putative.confident]
@@ -320,16 +343,19 @@ class _Points:
 
     def guided(self, areas: Sequence[AreaMatch]) -> list[MatchedArea]:
         """Point matches inside areas that say themselves how finely they are cropped."""
+        (image0, image1), turns = self.images, self.look.turns
         crops = [
-            (_scaled_crop(self.images[0], a.area0.box, a.scale0), _scaled_crop(self.images[1], a.area1.box, a.scale1))
+            (_scaled_crop(image0, a.area0.box, a.scale0), _scaled_crop(image1, a.area1.box, a.scale1).turned(turns))
             for a in areas
         ]
         found = zip(areas, crops, self._match(crops), strict=True)
         return [self._matched(area, pair, matches) for area, pair, matches in found]
 
-    def _within_budget(self, planned: Sequence[AreaMatch], crops: Sequence[tuple[Crop, Crop]]) -> list[int]:
+    def _within_budget(
+        self, planned: Sequence[AreaMatch], crops: Sequence[tuple[Crop, Crop]], max_pixels: int
+    ) -> list[int]:
         """Rows to match: in order, until the pixel budget is spent."""
-        budget = self.options.max_crop_pixels or float("inf")
+        budget = max_pixels or float("inf")
         spent, rows = 0, []
         for k, (area, pair) in enumerate(zip(planned, crops, strict=True)):
             if area.state is AreaState.SKIPPED:
@@ -360,7 +386,6 @@ class _Points:
         """Run the point matcher and bring its points to image pixels."""
         if not crops:
             return []
-        crops = [(crop0, crop1.turned(self._turns)) for crop0, crop1 in crops]
         self.pixels += sum(crop.size[0] * crop.size[1] for pair in crops for crop in pair)
         start = time.perf_counter()
         matched = self.matcher.match(crops)

@@ -249,6 +249,8 @@ class GuidanceOptions(_Checked):
     """So many consistent whole-image matches need no areas to find more evidence (0: areas always)."""
     sure_inlier_ratio: float = 0.5
     """And so large a share of all of them is consistent."""
+    min_inlier_ratio: float = 0.3
+    """Where a smaller share is, the images are taken to show different things, and nothing more is tried (0: it is)."""
     max_chance: float = 0.01
     """Where they do not agree, area pairs are matched that whole-image matches join more often than chance: the largest
     probability of chance (1: all area pairs)."""
@@ -283,6 +285,24 @@ class TurningOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class ZoomOptions(_Checked):
+    """Photos taken from near and from far (not in the paper)."""
+
+    enabled: bool = True
+    """Where whole images do not agree, look whether they do once one of them is made smaller."""
+    share: float = 1 / 3
+    """Size of the smaller one, share of a whole image's at the matcher, 0.01 to 1."""
+    min_inliers: int = 25
+    """Fewest consistent matches for a change of size."""
+    min_lead: float = 1.5
+    """And at least so many times those that the images have as they are."""
+
+    def __post_init__(self) -> None:
+        _Checked.__post_init__(self)
+        self._within("share", 0.01, 1)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class SGAMOptions(_Checked):
     """All stages of the algorithm."""
 
@@ -296,6 +316,8 @@ class SGAMOptions(_Checked):
     """The area matcher `covisible`."""
     turning: TurningOptions = field(default_factory=TurningOptions)
     """Quarter turns."""
+    zoom: ZoomOptions = field(default_factory=ZoomOptions)
+    """Changes of size."""
     geometry: GeometryOptions = field(default_factory=GeometryOptions)
     """Robust estimation."""
     prediction: PredictionOptions = field(default_factory=PredictionOptions)
@@ -331,6 +353,7 @@ PAPER = changed(
     collection__min_coverage=0.3,
     guidance__enabled=False,
     turning__enabled=False,
+    zoom__enabled=False,
 )
 """The paper's own parameters (its appendix), with GR in the form that can accept an area."""
 

@@ -325,7 +325,8 @@ class PairResult:
     whole_scale1: matcher pixels per image pixel of plain whole-image matching at the same options. fallback: why the
     whole images were matched instead of areas, empty when areas were used. notes: limits that were reached.
     pixels_matched: sum over both sides of every point-matcher call. turns: quarter turns anticlockwise by which the
-    point matcher saw the second image. seconds: by stage.
+    point matcher saw the second image. zoom: size at which it saw the second whole image over that of the first one,
+    against plain matching: below 1 the second one was made smaller, above 1 the first one. seconds: by stage.
     """
 
     matches: Matches
@@ -339,4 +340,5 @@ class PairResult:
     notes: tuple[str, ...] = ()
     pixels_matched: int = 0
     turns: int = 0
+    zoom: float = 1.0
     seconds: Mapping[str, float] = field(default_factory=dict)

@@ -29,6 +29,7 @@ from sgam_core.options import (
     SemanticOptions,
     TileOptions,
     TurningOptions,
+    ZoomOptions,
 )
 from sgam_sfm.keypoints import KeypointOptions
 from sgam_sfm.machine import Precision
@@ -166,6 +167,8 @@ class MatchOptions:
     """Area matcher covisible."""
     turning: TurningOptions = field(default_factory=TurningOptions)
     """Photos taken upright and sideways."""
+    zoom: ZoomOptions = field(default_factory=ZoomOptions)
+    """Photos taken from near and from far."""
     geometry: GeometryOptions = field(default_factory=GeometryOptions)
     """Robust epipolar geometry."""
     prediction: PredictionOptions = field(default_factory=PredictionOptions)

@@ -269,6 +269,8 @@ def swapped(result: PairResult) -> PairResult:
         coverage1=result.coverage0,
         whole_scale0=result.whole_scale1,
         whole_scale1=result.whole_scale0,
+        turns=-result.turns % 4,
+        zoom=1 / result.zoom,
     )
 
 

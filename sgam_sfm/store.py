@@ -35,7 +35,10 @@ from sgam_sfm.files import replacing
 from sgam_sfm.pairs import Pair
 
 _ARRAYS = tuple(array.name for array in fields(Matches))
-_FACTS = ("fallback", "coverage0", "coverage1", "whole_scale0", "whole_scale1", "notes", "pixels_matched", "turns")
+_FACTS = (
+    *("fallback", "coverage0", "coverage1", "whole_scale0", "whole_scale1"),
+    *("notes", "pixels_matched", "turns", "zoom"),
+)
 _AREAS = TypeAdapter(tuple[AreaMatch, ...])
 _DIGEST_BLOCK = 512  # bytes before the HDF5 file proper: the smallest user block there is
 _MAX_MATCHES = 10**8  # of a block: a file made by hand can claim any number in a few bytes

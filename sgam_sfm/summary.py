@@ -54,6 +54,7 @@ class CountedPairs:
         self._totals["pixels_matched"] += result.pixels_matched
         self._totals["pairs_with_limits"] += bool(result.notes)
         self._totals["pairs_turned"] += bool(result.turns)
+        self._totals["pairs_zoomed"] += result.zoom != 1
         self._coverage += (result.coverage0 + result.coverage1) / 2
         if result.fallback:
             self._fallbacks[result.fallback.partition(":")[0]] += 1
@@ -75,6 +76,7 @@ class CountedPairs:
             "mean_resolution_gain": self._scale / max(self._totals["areas_kept"], 1),
             "pairs_with_limits": self._totals["pairs_with_limits"],
             "pairs_turned": self._totals["pairs_turned"],
+            "pairs_zoomed": self._totals["pairs_zoomed"],
             "raw_matches": self._totals["raw_matches"],
             "pixels_matched": self._totals["pixels_matched"],
         }

@@ -124,6 +124,9 @@ def _facts(picture: PairPicture) -> list[str]:
         lines.append(f"Matched as whole images: {result.fallback}.")
     if result.turns:
         lines.append(f"The right image was turned anticlockwise by {90 * result.turns} degrees to be matched.")
+    if result.zoom != 1:
+        side = "right" if result.zoom < 1 else "left"
+        lines.append(f"The {side} image, taken from nearer, was made smaller to be matched as a whole.")
     if result.notes:
         lines.append(f"Limits reached: {'; '.join(result.notes)}.")
     if picture.missing:

@@ -1,15 +1,17 @@
-"""Photos taken sideways: found out by quarter turns, and matched as if they were upright."""
+"""Looks: photos taken sideways are matched as if they were upright, near ones as if they were taken from afar."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 
 from sgam_core import SemanticAreaMatcher, SGAMOptions, WholeImages, match_described
 from sgam_core.geometry import residuals
-from sgam_core.options import changed
+from sgam_core.looks import Look, best_look
+from sgam_core.options import TurningOptions, ZoomOptions, changed
 from sgam_core.types import Image, PairResult
 from sgam_sfm.matchers.xfeat import XFeatStar
 from tests.room import Room, TrueMatcher
@@ -75,3 +77,61 @@ def test_a_learned_matcher_finds_sideways_what_it_finds_upright(room):
     assert upright.two_view is not None
     stored = replace(turned.matches, points1=back)
     assert (residuals(upright.two_view.F, stored) < options.geometry.max_residual).mean() > 0.9
+
+
+PLAIN = Look(sizes=(900, 600))
+FAR, NEAR = Look(sizes=(300, 600)), Look(sizes=(900, 200))
+
+
+def chosen(found: dict[Look, int], agreeing: tuple[Look, ...] = (), **zoom) -> tuple[Look, list[Look]]:
+    """The best look where those of `found` have so many inliers and others none, and all looks that were asked for."""
+    asked = []
+
+    def inliers(looks):
+        asked.extend(looks)
+        return [found.get(look, 0) for look in looks]
+
+    look = best_look(PLAIN, lambda look: look in agreeing, inliers, TurningOptions(), ZoomOptions(**zoom))
+    return look, asked
+
+
+def test_images_that_agree_are_looked_at_once():
+    assert chosen({NEAR: 1000}, agreeing=(PLAIN,)) == (PLAIN, [])
+
+
+def test_the_image_taken_from_near_is_made_smaller():
+    assert chosen({NEAR: 40, FAR: 10, PLAIN: 12})[0] == NEAR
+    assert chosen({NEAR: 40, FAR: 60, PLAIN: 12})[0] == FAR
+
+
+def test_a_smaller_image_must_find_clearly_more():
+    assert chosen({NEAR: 24})[0] == PLAIN  # as few as chance finds
+    assert chosen({NEAR: 59, PLAIN: 40})[0] == PLAIN
+    assert chosen({NEAR: 60, PLAIN: 40})[0] == NEAR
+    assert chosen({NEAR: 60, PLAIN: 40}, enabled=False)[0] == PLAIN
+
+
+def test_a_turned_image_may_be_near_too():
+    small = [Look(sizes=(512, 512), turns=turns) for turns in range(4)]
+    turned = replace(NEAR, turns=1)
+    assert chosen({small[1]: 30, turned: 50})[0] == turned
+    assert chosen({small[1]: 30}, agreeing=(replace(PLAIN, turns=1),)) == (replace(PLAIN, turns=1), small)
+
+
+def test_a_learned_matcher_sees_through_a_change_of_size(room):
+    options = changed(SGAMOptions(), crop__image_size=640)
+    image0, image1 = (room.images[name] for name in PAIR)
+    width, height = image1.width // 4, image1.height // 4
+    x, y = (image1.width - width) // 2, (image1.height - height) // 2
+    centre = image1.pixels[y : y + height, x : x + width]
+    near = Image(name="near", pixels=cv2.resize(centre, (4 * width, 4 * height), interpolation=cv2.INTER_CUBIC))
+
+    found = matched(room, XFeatStar(), options, (image0, near))
+    assert found.zoom == pytest.approx(1 / 3, rel=0.01)
+    upright = matched(room, XFeatStar(), options)
+    assert upright.two_view is not None
+    original = replace(found.matches, points1=found.matches.points1 / 4 + (x, y))
+    right = (residuals(upright.two_view.F, original) < options.geometry.max_residual).sum()
+    plain = matched(room, XFeatStar(), changed(options, zoom__enabled=False), (image0, near))
+    assert plain.two_view is None or right > 2 * plain.two_view.num_inliers
+    assert right > 0.8 * len(found.matches) > 40
