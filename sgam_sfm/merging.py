@@ -154,8 +154,8 @@ def merging(
         for edges in _strongest_first(raw, scratch):
             tracks.join(edges)
         if options.track_radius_px > 0 and options.min_shared_images > 0:
-            for edges in _side_by_side(tracks, bounds, options.min_shared_images, scratch):
-                tracks.join(edges, options.min_shared_images)
+            near = _side_by_side(tracks, bounds, options.min_shared_images, scratch)
+            tracks.join_tracks(near, options.min_shared_images)
         for begin, end in pairwise(bounds.tolist()):
             tracks.settle(begin, told.read(begin, end - begin)[:, 3], _OCTAVE)
         num_conflicts = _align(raw, tracks, scratch)
