@@ -198,9 +198,9 @@ def _rearrange(rows: np.ndarray, place: np.ndarray, origin: np.ndarray) -> None:
 
     Args: origin: the keypoint that comes to every place.
     """
-    halves = rows.view(np.int64)
-    for column in range(halves.shape[1]):  # one after the other: there is no memory for all of them twice
-        halves[:, column] = halves[origin, column]
+    words = rows.view(np.int64)
+    for column in range(words.shape[1]):  # one after the other: there is no memory for all of them twice
+        words[:, column] = words[origin, column]
     _rename(rows, place)
 
 
