@@ -26,7 +26,7 @@ def sampson_distance(
     lines1 = x0 @ F[:, :2].T + F[:, 2]
     lines0 = x1 @ F[:2, :] + F[2, :]
     algebraic = np.einsum("md,md->m", x1, lines1[:, :2]) + lines1[:, 2]
-    gradient = (lines1[:, :2] ** 2).sum(1) + (lines0[:, :2] ** 2).sum(1)
+    gradient = (lines1[:, 0] ** 2 + lines1[:, 1] ** 2) + (lines0[:, 0] ** 2 + lines0[:, 1] ** 2)
     distances: np.ndarray = algebraic**2 / np.maximum(gradient, np.finfo(float).tiny)
     return distances
 

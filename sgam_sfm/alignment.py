@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sgam_sfm.compiled import compiled
+from sgam_sfm.sorting import stable_order
 
 _PRIOR_WEIGHT = 0.005  # pull of a keypoint to its own points, against 0.5 for a sure match; a track could drift else
 _TOLERANCE = 1e-4  # of the moves, which are fractions of a pixel
@@ -33,7 +34,7 @@ def align_keypoints(
         keypoint of side 1 starts from where the match puts it, see `offsets_of`. affine: A, row by row. weights: per
         squared image-1 pixel.
     """
-    order = np.argsort(tracks, kind="stable")
+    order = stable_order(tracks)
     ends = np.flatnonzero(np.diff(tracks[order], append=-1)) + 1
     _solve(order, ends, index, offsets, affine, weights, sigmas, keypoints, slots)
 
@@ -68,10 +69,16 @@ def _solve(
     slot: np.ndarray,
 ) -> None:
     """Conjugate gradients track by track."""
+    begin, longest = 0, 0
+    for end in ends:
+        longest, begin = max(longest, end - begin), end
+    # Memory for any track: its keypoints get places 0, 1, ...
+    members, prior = np.empty(2 * longest, np.int64), np.empty(2 * longest)
+    diagonal, residual, solution = np.empty((2 * longest, 2)), np.empty((2 * longest, 2)), np.empty((2 * longest, 2))
+    direction, product = np.empty((2 * longest, 2)), np.empty((2 * longest, 2))
+    sides = np.empty((longest, 2), np.int64)
     begin = 0
     for end in ends:
-        # The keypoints of the track get places 0, 1, ...
-        members = np.empty(2 * (end - begin), np.int64)
         count = 0
         for place in range(begin, end):
             for side in range(2):
@@ -80,22 +87,26 @@ def _solve(
                     slot[keypoint] = count
                     members[count] = keypoint
                     count += 1
-        prior, diagonal, residual = np.empty(count), np.empty((count, 2)), np.zeros((count, 2))
+                sides[place - begin, side] = slot[keypoint]
         for place in range(count):
             prior[place] = _PRIOR_WEIGHT / np.float64(sigmas[members[place]]) ** 2
-            diagonal[place, 0] = diagonal[place, 1] = prior[place]
+            for axis in range(2):
+                diagonal[place, axis] = prior[place]
+                residual[place, axis] = solution[place, axis] = 0
         for place in range(begin, end):
-            row = order[place]
-            one, other, weight = slot[index[row, 0]], slot[index[row, 1]], weights[row]
+            row, one, other = order[place], sides[place - begin, 0], sides[place - begin, 1]
+            weight = weights[row]
             for axis in range(2):
                 residual[other, axis] -= weight * offsets[row, axis]
                 diagonal[other, axis] += weight
                 for column in range(2):
                     residual[one, column] += weight * affine[row, 2 * axis + column] * offsets[row, axis]
                     diagonal[one, column] += weight * affine[row, 2 * axis + column] ** 2
-        solution = np.zeros((count, 2))
-        direction, product = residual / diagonal, np.empty((count, 2))
-        energy = np.sum(residual * direction)
+        energy = 0.0
+        for place in range(count):
+            for axis in range(2):
+                direction[place, axis] = residual[place, axis] / diagonal[place, axis]
+                energy += residual[place, axis] * direction[place, axis]
         enough = _TOLERANCE**2 * energy
         for _ in range(_MAX_ROUNDS):
             if energy <= enough or energy <= 1e-24:
@@ -104,20 +115,28 @@ def _solve(
                 for axis in range(2):
                     product[place, axis] = prior[place] * direction[place, axis]
             for place in range(begin, end):
-                row = order[place]
-                one, other, weight = slot[index[row, 0]], slot[index[row, 1]], weights[row]
+                row, one, other = order[place], sides[place - begin, 0], sides[place - begin, 1]
+                weight = weights[row]
                 x, y = direction[one, 0], direction[one, 1]
                 for axis in range(2):
                     error = direction[other, axis] - affine[row, 2 * axis] * x - affine[row, 2 * axis + 1] * y
                     product[other, axis] += weight * error
                     product[one, 0] -= weight * affine[row, 2 * axis] * error
                     product[one, 1] -= weight * affine[row, 2 * axis + 1] * error
-            length = energy / np.sum(direction * product)
-            solution += length * direction
-            residual -= length * product
-            scaled = residual / diagonal
-            before, energy = energy, np.sum(residual * scaled)
-            direction = scaled + (energy / before) * direction
+            curvature = 0.0
+            for place in range(count):
+                for axis in range(2):
+                    curvature += direction[place, axis] * product[place, axis]
+            length, before, energy = energy / curvature, energy, 0.0
+            for place in range(count):
+                for axis in range(2):
+                    solution[place, axis] += length * direction[place, axis]
+                    residual[place, axis] -= length * product[place, axis]
+                    energy += residual[place, axis] * (residual[place, axis] / diagonal[place, axis])
+            for place in range(count):
+                for axis in range(2):
+                    scaled = residual[place, axis] / diagonal[place, axis]
+                    direction[place, axis] = scaled + (energy / before) * direction[place, axis]
         for place in range(count):
             for axis in range(2):
                 keypoints[members[place], axis] += solution[place, axis]

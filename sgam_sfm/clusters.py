@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 
 from sgam_sfm.compiled import compiled
 from sgam_sfm.grid import cells_around, grid_of, nearest
+from sgam_sfm.sorting import stable_order
 
 _CELLS_A_RADIUS = 8  # points of a matcher's grid coincide: one spot a fine cell keeps the number of neighbours small
 
@@ -51,25 +52,35 @@ def _nearest_of(keypoints: np.ndarray, points: np.ndarray, radius: float) -> np.
     return found
 
 
-@compiled
 def _cluster(points: np.ndarray, weights: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
     """Means (N, 2) of the clusters around the densest points, and the cluster of every point."""
-    count = len(points)
-    if count == 0:
+    if not len(points):
         return np.zeros((0, 2)), np.zeros(0, np.int64)
-    fine = np.floor(points / (radius / _CELLS_A_RADIUS) + 0.5).astype(np.int64)
-    low = min(fine[:, 1])
-    keys = fine[:, 0] * (max(fine[:, 1]) - low + 1) + (fine[:, 1] - low)
-    by_cell = np.argsort(keys, kind="mergesort")
-    spot_of = np.empty(count, np.int64)
-    last = -1
-    for place in range(count):
-        if place == 0 or keys[by_cell[place]] != keys[by_cell[place - 1]]:
-            last += 1
-        spot_of[by_cell[place]] = last
-    spots, spot_weights = _means(spot_of, points, weights, last + 1)
-
+    spot_of = _fine_cells(points, radius / _CELLS_A_RADIUS)
+    spots, spot_weights = _means(spot_of, points, weights, spot_of.max() + 1)
     frame, start, order = grid_of(spots, radius)
+    density = _density(spots, spot_weights, frame, start, order, radius)
+    seeds = spots[_seeds(spots, stable_order(-density), frame, start, order, radius)]
+    labels = _nearest_of(seeds, spots, radius * (1 + 1e-9))[spot_of]
+    means, _ = _means(labels, points, weights, len(seeds))
+    return means, labels
+
+
+def _fine_cells(points: np.ndarray, width: float) -> np.ndarray:
+    """The cell of every point (M,), numbered 0, 1, ... without gaps."""
+    columns, rows = np.floor(points / width + 0.5).astype(np.int64).T
+    keys = columns * (rows.max() - rows.min() + 1) + (rows - rows.min())
+    order = stable_order(keys)
+    cells = np.empty(len(points), np.int64)
+    cells[order] = np.cumsum(np.diff(keys[order], prepend=keys[order[:1]]) != 0)
+    return cells
+
+
+@compiled
+def _density(
+    spots: np.ndarray, weights: np.ndarray, frame: np.ndarray, start: np.ndarray, order: np.ndarray, radius: float
+) -> np.ndarray:
+    """The sum of weights within a radius of every spot."""
     rows = int(frame[4])
     density = np.zeros(len(spots))
     for spot in range(len(spots)):
@@ -79,11 +90,18 @@ def _cluster(points: np.ndarray, weights: np.ndarray, radius: float) -> tuple[np
                 other = order[place]
                 step_x, step_y = spots[other, 0] - spots[spot, 0], spots[other, 1] - spots[spot, 1]
                 if step_x * step_x + step_y * step_y <= radius * radius:
-                    density[spot] += spot_weights[other]
+                    density[spot] += weights[other]
+    return density
 
-    # Densest first, a spot becomes a seed unless it is within the radius of one.
+
+@compiled
+def _seeds(
+    spots: np.ndarray, wanted: np.ndarray, frame: np.ndarray, start: np.ndarray, order: np.ndarray, radius: float
+) -> np.ndarray:
+    """Which spots become seeds: one after the other as `wanted`, unless it is within the radius of one."""
+    rows = int(frame[4])
     closed, chosen = np.zeros(len(spots), np.bool_), np.zeros(len(spots), np.bool_)
-    for spot in np.argsort(-density, kind="mergesort"):
+    for spot in wanted:
         if closed[spot]:
             continue
         chosen[spot] = True
@@ -94,15 +112,7 @@ def _cluster(points: np.ndarray, weights: np.ndarray, radius: float) -> tuple[np
                 step_x, step_y = spots[other, 0] - spots[spot, 0], spots[other, 1] - spots[spot, 1]
                 if step_x * step_x + step_y * step_y <= radius * radius:
                     closed[other] = True
-    seeds = spots[chosen]
-    seed_frame, seed_start, seed_order = grid_of(seeds, radius)
-    label = np.empty(len(spots), np.int64)
-    for spot in range(len(spots)):
-        x, y = spots[spot, 0], spots[spot, 1]
-        label[spot] = nearest(seeds, seed_frame, seed_start, seed_order, x, y, radius * (1 + 1e-9))
-    labels = label[spot_of]
-    means, _ = _means(labels, points, weights, len(seeds))
-    return means, labels
+    return chosen
 
 
 @compiled

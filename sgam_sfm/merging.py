@@ -18,7 +18,7 @@ Distances are in matcher pixels (image pixels / sigma), so that coarse and fine 
 only read: merging can be repeated with other options.
 
 Memory does not grow with the matches. They are kept in one file, a row each, which every step reads again, pair by pair
-or image by image; what must be in another order is sorted on disk. In memory are 24 bytes a keypoint and small records
+or image by image; what must be in another order is sorted on disk. In memory are 40 bytes a keypoint and small records
 of images and pairs. Results do not depend on the order of the pairs, nor on the number of threads.
 """
 
@@ -45,6 +45,7 @@ from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions
 from sgam_sfm.matchers.subpixel import refine
 from sgam_sfm.pairs import Pair
 from sgam_sfm.scratch import Rows, Scratch, batches, in_order
+from sgam_sfm.sorting import stable_order
 from sgam_sfm.tracks import Tracks
 
 _log = logging.getLogger(__name__)
@@ -55,6 +56,7 @@ _OCTAVE = 2.0  # points whose sigma is so many times the finest have no say in w
 _AT_ONCE = 2**15  # matches in one go
 _ROWS_A_PART = 2**18  # rows that are sorted in memory
 _STEPS = 16  # of strength in an octave: a stronger match joins first, those alike in the order of their pairs
+_MIDDLE = 2**13  # the level of strength 1; that of any number of single precision is within it
 _SHARED = 1000  # no two tracks share more images, as far as their order is concerned
 
 _PATCHES_AT_ONCE = 2**13
@@ -154,8 +156,8 @@ def merging(
         for edges in _strongest_first(raw, scratch):
             tracks.join(edges)
         if options.track_radius_px > 0 and options.min_shared_images > 0:
-            for edges in _side_by_side(tracks, bounds, options.min_shared_images, scratch):
-                tracks.join(edges, options.min_shared_images)
+            near = _side_by_side(tracks, bounds, options.min_shared_images, scratch)
+            tracks.join_tracks(near, options.min_shared_images)
         for begin, end in pairwise(bounds.tolist()):
             tracks.settle(begin, told.read(begin, end - begin)[:, 3], _OCTAVE)
         num_conflicts = _align(raw, tracks, scratch)
@@ -290,7 +292,7 @@ def _strengths(index: np.ndarray, weights: np.ndarray, variances: np.ndarray) ->
         edges[count, 0], edges[count, 1] = key >> 32, key & 0xFFFFFFFF
         octave = np.floor(np.log2(support))
         step = np.floor((support / 2.0**octave - 1) * _STEPS)
-        levels[count] = (0 if num_inliers else 1 << 20) + 2**15 - int(octave * _STEPS + step)
+        levels[count] = (0 if num_inliers else 2 * _MIDDLE) + _MIDDLE - int(octave * _STEPS + step)
         count += 1
     return edges[:count], levels[:count]
 
@@ -316,7 +318,7 @@ def _side_by_side(tracks: Tracks, bounds: np.ndarray, min_shared: int, scratch: 
 def _shared(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The different pairs of tracks (T, 2), in how many images they are near, and their mean distance there."""
     keys = (rows[:, 0].astype(np.int64) << 32) | rows[:, 1].astype(np.int64)
-    order = np.argsort(keys, kind="stable")
+    order = stable_order(keys)
     begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
     distances = rows.view(np.float32)[order, 2].astype(np.float64)
     shared = np.diff(begins, append=len(keys))

@@ -13,6 +13,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from sgam_sfm.sorting import stable_order
+
 _BUFFERED = 2**25  # bytes that wait in memory before they are written
 _ROWS_AT_ONCE = 2**19
 
@@ -95,7 +97,7 @@ class Sorted:
         """Add rows (n, width) under labels (n,)."""
         if not len(rows):
             return
-        order = np.argsort(labels, kind="stable")
+        order = stable_order(labels)
         labels, rows = labels[order], np.ascontiguousarray(rows[order], self._dtype)
         begins = np.flatnonzero(np.diff(labels, prepend=labels[:1] - 1))
         for label, part in zip(labels[begins].tolist(), np.split(rows, begins[1:]), strict=True):

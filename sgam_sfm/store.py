@@ -35,6 +35,7 @@ from sgam_sfm.files import replacing
 from sgam_sfm.pairs import Pair
 
 _ARRAYS = tuple(array.name for array in fields(Matches))
+_PACKED = ("sigmas0", "sigmas1", "area_index")
 _FACTS = (
     *("fallback", "coverage0", "coverage1", "whole_scale0", "whole_scale1"),
     *("notes", "pixels_matched", "turns", "zoom"),
@@ -129,8 +130,8 @@ def _write_records(file: h5py.File, records: Sequence[PairRecord]) -> None:
     for name in _ARRAYS:
         array = getattr(joined, name)
         array = array.astype(np.float32) if array.dtype == np.float64 else array
-        # Points are as good as random: packing them costs time and saves nothing.
-        pack = bool(len(array)) and not name.startswith("points")
+        # Points and scores are as good as random: packing them costs time and saves nothing.
+        pack = bool(len(array)) and name in _PACKED
         file.create_dataset(name, data=array, compression="lzf" if pack else None)
 
 

@@ -5,7 +5,7 @@ Keypoints of the whole collection are numbered 0..K-1, image by image.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 
 import numpy as np
@@ -25,7 +25,7 @@ _COLUMNS = 6
 class Tracks:
     """Tracks of keypoints, each with at most one keypoint in an image; every keypoint is one of its own to begin with.
 
-    It takes 24 bytes a keypoint and nothing for a match.
+    It takes 24 bytes a keypoint, 40 while tracks are joined with each other, and nothing for a match.
 
     points (K, 2), images (K,), sigmas (K,): of the keypoints. radius: matcher pixels within which two keypoints of an
     image may become one.
@@ -52,7 +52,7 @@ class Tracks:
     def _begin(self, count: int, num_images: int, radius: float) -> None:
         self._rows = np.empty((count, _COLUMNS), np.int32)
         self._values = self._rows.view(np.float32)
-        self._stamps = np.full(num_images, -1, np.int32)
+        self._num_images = num_images
         self._radius = radius
 
     def _fill(self, begin: int, points: np.ndarray, images: np.ndarray, sigmas: np.ndarray) -> None:
@@ -73,14 +73,25 @@ class Tracks:
         """Where keypoints lie."""
         return self._values[keypoints, _X : _Y + 1].astype(np.float64)
 
-    def join(self, edges: Int[np.ndarray, "E 2"], min_shared: int = 0) -> None:
+    def join(self, edges: Int[np.ndarray, "E 2"]) -> None:
         """Make one track of those of each edge's keypoints, unless that needs one keypoint at two distant spots.
 
         The edges are taken one after the other.
+        """
+        _join(self._rows, self._values, self._num_images, edges, self._radius, 0)
+
+    def join_tracks(self, edges: Iterable[np.ndarray], min_shared: int) -> None:
+        """The same for edges (E, 2) that come in parts, between tracks that have grown already.
 
         min_shared: number of images that both tracks of an edge must be in.
         """
-        _join(self._rows, self._values, self._stamps, edges, self._radius, min_shared)
+        place = _track_by_track(self._rows)
+        origin = np.empty_like(place)
+        origin[place] = np.arange(len(place), dtype=np.int32)
+        _rearrange(self._rows, place, origin)
+        for part in edges:
+            _join(self._rows, self._values, self._num_images, place[part], self._radius, min_shared)
+        _rearrange(self._rows, origin, place)
 
     def settle(self, begin: int, weights: np.ndarray, octave: float) -> None:
         """End joining: put every standing keypoint of an image to the mean of those that became part of it.
@@ -161,9 +172,52 @@ def _standing(rows: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
 
 
 @compiled
+def _track_by_track(rows: np.ndarray) -> np.ndarray:
+    """A place (K,) for every keypoint such that those of a track that stand for it are next to each other."""
+    place, count = np.full(len(rows), -1, np.int32), 0
+    for root in range(len(rows)):
+        if rows[root, _PARENT] >= 0:
+            continue
+        first = _stands(rows, root)
+        member = first
+        while True:
+            place[member] = count
+            count += 1
+            member = rows[member, _LINK]
+            if member == first:
+                break
+    for keypoint in range(len(rows)):
+        if place[keypoint] < 0:
+            place[keypoint] = count
+            count += 1
+    return place
+
+
+def _rearrange(rows: np.ndarray, place: np.ndarray, origin: np.ndarray) -> None:
+    """Move every keypoint to its place, and all that refers to it along.
+
+    Args: origin: the keypoint that comes to every place.
+    """
+    words = rows.view(np.int64)
+    for column in range(words.shape[1]):  # one after the other: there is no memory for all of them twice
+        words[:, column] = words[origin, column]
+    _rename(rows, place)
+
+
+@compiled
+def _rename(rows: np.ndarray, names: np.ndarray) -> None:
+    for row in range(len(rows)):
+        if rows[row, _PARENT] >= 0:
+            rows[row, _PARENT] = names[rows[row, _PARENT]]
+        rows[row, _LINK] = names[rows[row, _LINK]]
+
+
+@compiled
 def _join(
-    rows: np.ndarray, values: np.ndarray, stamps: np.ndarray, edges: np.ndarray, radius: float, min_shared: int
+    rows: np.ndarray, values: np.ndarray, num_images: int, edges: np.ndarray, radius: float, min_shared: int
 ) -> None:
+    # Of every image the last edge whose second track was in it, and the keypoint of that track there.
+    stamps = np.full((num_images, 2), -1, np.int64)
     for edge in range(len(edges)):
         kept, gone = _root(rows, edges[edge, 0]), _root(rows, edges[edge, 1])
         if kept == gone:
@@ -173,7 +227,8 @@ def _join(
         first = _stands(rows, gone)
         member = first
         while True:
-            stamps[rows[member, _IMAGE]] = member
+            image = rows[member, _IMAGE]
+            stamps[image, 0], stamps[image, 1] = edge, member
             member = rows[member, _LINK]
             if member == first:
                 break
@@ -181,8 +236,9 @@ def _join(
         entry = _stands(rows, kept)
         member = entry
         while True:
-            other = stamps[rows[member, _IMAGE]]
-            if other >= 0:
+            image = rows[member, _IMAGE]
+            if stamps[image, 0] == edge:
+                other = stamps[image, 1]
                 shared += 1
                 step_x = np.float64(values[member, _X]) - values[other, _X]
                 step_y = np.float64(values[member, _Y]) - values[other, _Y]
@@ -194,23 +250,15 @@ def _join(
             if member == entry:
                 break
         if fine and shared >= min_shared:
-            rows[kept, _PARENT] = -_one_ring(rows, values, stamps, entry, first)
+            rows[kept, _PARENT] = -_one_ring(rows, values, stamps, edge, entry, first)
             rows[gone, _PARENT] = kept
-            continue
-        member = first
-        while True:
-            stamps[rows[member, _IMAGE]] = -1
-            member = rows[member, _LINK]
-            if member == first:
-                break
 
 
 @compiled
-def _one_ring(rows: np.ndarray, values: np.ndarray, stamps: np.ndarray, entry: int, first: int) -> int:
+def _one_ring(rows: np.ndarray, values: np.ndarray, stamps: np.ndarray, edge: int, entry: int, first: int) -> int:
     """One ring of two, with the finer of two keypoints of an image.
 
-    Args: entry, first: a keypoint of either. stamps: the keypoint of the second ring in every image, -1 for none; they
-        are cleared.
+    Args: entry, first: a keypoint of either. stamps: the second ring's, see `_join`; they are changed.
     Returns: the length of the ring.
     """
     head, last, count = -1, -1, 0
@@ -218,18 +266,17 @@ def _one_ring(rows: np.ndarray, values: np.ndarray, stamps: np.ndarray, entry: i
         member = start
         while True:
             follower, image = rows[member, _LINK], rows[member, _IMAGE]
-            other, stays = stamps[image], True
-            if start == entry and other >= 0:
+            other, stays = stamps[image, 1], True
+            if start == entry and stamps[image, 0] == edge:
                 stays = values[other, _SIGMA] >= values[member, _SIGMA]
                 if stays:
-                    stamps[image] = -2 - member  # told to the other one when its turn comes
+                    stamps[image, 1] = -2 - member  # told to the other one when its turn comes
                 else:
                     rows[member, _LINK] = other
             elif start == first:
                 stays = other >= 0
                 if not stays:
                     rows[member, _LINK] = -2 - other
-                stamps[image] = -1
             if not stays:
                 rows[member, _IMAGE] = -1 - image
             else:
