@@ -16,8 +16,8 @@ from sgam_core.covisible import Frame
 from sgam_core.crops import area_crop, box_crop, whole_crop
 from sgam_core.geometry import estimate_two_view, residuals
 from sgam_core.guidance import guided_areas
-from sgam_core.looks import Look, best_look
-from sgam_core.options import CropOptions, GuidanceOptions, SGAMOptions
+from sgam_core.looks import Look, agree, best_look
+from sgam_core.options import CropOptions, SGAMOptions
 from sgam_core.prediction import Estimate, MatchedArea, predict
 from sgam_core.protocols import AreaMatcher, PointMatcher
 from sgam_core.rejection import reject
@@ -82,13 +82,8 @@ def match_described(
     plain = points.look
     guides = getattr(area_matcher, "guides", False)
     if guides:
-        points.look = best_look(
-            plain,
-            agrees=lambda look: _agree(points.model(look, estimate), options.guidance),
-            inliers=partial(points.inliers, estimate=estimate),
-            turning=options.turning,
-            zoom=options.zoom,
-        )
+        models = partial(points.models, estimate=estimate)
+        points.look = best_look(plain, models, options.turning, options.zoom, options.guidance)
     guides = guides and options.guidance.enabled
     found = _plain(points, estimate, options) if guides else None
     clock.lap("whole images")
@@ -141,18 +136,11 @@ def _plain(points: _Points, estimate: Estimate, options: SGAMOptions) -> _Found 
     """The whole images, where they agree so well or so little that areas have nothing to add; None elsewhere."""
     model = points.agreement(estimate)
     found = partial(_Found, matches=points.whole(), model=model)
-    if _agree(model, options.guidance):
+    if agree(model, options.guidance.sure_matches, options.guidance):
         return found(fallback="whole images agree, and crops would be no finer")
     if (model.inlier_ratio if model else 0.0) < options.guidance.min_inlier_ratio:
         return found(fallback="whole images do not agree", final=True)
     return None
-
-
-def _agree(model: TwoViewModel | None, options: GuidanceOptions) -> bool:
-    """Whether whole images agree so well that nothing else need be tried; never without `sure_matches`."""
-    if model is None or not options.sure_matches:
-        return False
-    return model.num_inliers >= options.sure_matches and model.inlier_ratio >= options.sure_inlier_ratio
 
 
 def _evidence_crops(options: SGAMOptions) -> CropOptions:
@@ -297,13 +285,15 @@ class _Points:
 
     def agreement(self, estimate: Estimate) -> TwoViewModel | None:
         """The geometry of the whole images."""
-        return self.model(self.look, estimate)
+        return self.models([self.look], estimate)[0]
 
-    def inliers(self, looks: Sequence[Look], estimate: Estimate) -> list[int]:
-        """How many plain matches of the whole images are consistent, seen in several ways."""
+    def models(self, looks: Sequence[Look], estimate: Estimate) -> list[TwoViewModel | None]:
+        """The geometry of the whole images, seen in several ways."""
         self._see(looks)
-        models = [self.model(look, estimate) for look in looks]
-        return [0 if model is None else model.num_inliers for model in models]
+        for look in looks:
+            if look not in self._models:
+                self._models[look] = estimate(self._seen[look])
+        return [self._models[look] for look in looks]
 
     def whole_crops(self, look: Look) -> tuple[Crop, Crop]:
         """What the matcher sees."""
@@ -317,13 +307,6 @@ class _Points:
         """Match whole images, together, in those ways in which they have not been matched yet."""
         missing = [look for look in looks if look not in self._seen]
         self._seen |= zip(missing, self._match([self.whole_crops(look) for look in missing]), strict=True)
-
-    def model(self, look: Look, estimate: Estimate) -> TwoViewModel | None:
-        """The geometry of the whole images, seen in some way."""
-        if look not in self._models:
-            self._see([look])
-            self._models[look] = estimate(self._seen[look])
-        return self._models[look]
 
     def inside(
         self, putative: PutativeAreas, options: CropOptions, max_candidates: int

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sgam_core.options import TurningOptions, ZoomOptions
+from sgam_core.options import GuidanceOptions, TurningOptions, ZoomOptions
+from sgam_core.types import TwoViewModel
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -30,28 +31,39 @@ class Look:
 
 def best_look(
     plain: Look,
-    agrees: Callable[[Look], bool],
-    inliers: Callable[[Sequence[Look]], Sequence[int]],
+    models: Callable[[Sequence[Look]], Sequence[TwoViewModel | None]],
     turning: TurningOptions,
     zoom: ZoomOptions,
+    guidance: GuidanceOptions,
 ) -> Look:
     """The look at which whole images agree clearly better than at the plain one, which it is where there is none.
 
-    Args: agrees: whether they agree so well at a look that no other is needed. inliers: consistent matches of each.
+    Args: models: the geometry of the whole images at each look. guidance: says when they agree.
     """
     look = plain
-    if turning.enabled and not agrees(look):
+    if turning.enabled and not agree(models([look])[0], guidance.sure_matches, guidance):
         size = turning.image_size
-        found = inliers([Look(sizes=(size, size), turns=turns) for turns in range(4)])
+        found = _inliers(models([Look(sizes=(size, size), turns=turns) for turns in range(4)]))
         best = int(np.argmax(found))
         if found[best] >= max(turning.min_inliers, turning.min_lead * found[0]):
             look = replace(plain, turns=best)
-    if zoom.enabled and not agrees(look):
+    if zoom.enabled and not agree(models([look])[0], zoom.sure_matches, guidance):
         large0, large1 = look.sizes
         small0, small1 = (max(round(zoom.share * side), 1) for side in look.sizes)
         smaller = [replace(look, sizes=sizes) for sizes in ((small0, large1), (large0, small1))]
-        found = inliers([look, *smaller])
+        found = _inliers(models([look, *smaller]))
         best = int(np.argmax(found[1:]))
         if found[1 + best] >= max(zoom.min_inliers, zoom.min_lead * found[0]):
             look = smaller[best]
     return look
+
+
+def agree(model: TwoViewModel | None, sure_matches: int, guidance: GuidanceOptions) -> bool:
+    """Whether whole images agree: so many of their matches, and a large share of all; never for 0 `sure_matches`."""
+    if model is None or not sure_matches:
+        return False
+    return model.num_inliers >= sure_matches and model.inlier_ratio >= guidance.sure_inlier_ratio
+
+
+def _inliers(models: Sequence[TwoViewModel | None]) -> list[int]:
+    return [0 if model is None else model.num_inliers for model in models]

@@ -245,7 +245,7 @@ class GuidanceOptions(_Checked):
 
     enabled: bool = True
     """Look again; otherwise the first round is the result, as in the paper."""
-    sure_matches: int = 150
+    sure_matches: int = 60
     """So many consistent whole-image matches need no areas to find more evidence (0: areas always)."""
     sure_inlier_ratio: float = 0.5
     """And so large a share of all of them is consistent."""
@@ -289,7 +289,9 @@ class ZoomOptions(_Checked):
     """Photos taken from near and from far (not in the paper)."""
 
     enabled: bool = True
-    """Where whole images do not agree, look whether they do once one of them is made smaller."""
+    """Where whole images do not agree well, look whether they do once one of them is made smaller."""
+    sure_matches: int = 150
+    """So many consistent matches need no such look (0: always look)."""
     share: float = 1 / 3
     """Size of the smaller one, share of a whole image's at the matcher, 0.01 to 1."""
     min_inliers: int = 25
@@ -370,7 +372,6 @@ FAST = changed(
     semantic__objects__max_per_image=3,
     semantic__intersections__enabled=False,
     prediction__max_candidates=3,
-    guidance__sure_matches=60,
     guidance__min_gain=1.2,
 )
 """At most half more time than whole images take: few areas, where whole images do not agree, and a second round only

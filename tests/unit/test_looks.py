@@ -11,8 +11,8 @@ import pytest
 from sgam_core import SemanticAreaMatcher, SGAMOptions, WholeImages, match_described
 from sgam_core.geometry import residuals
 from sgam_core.looks import Look, best_look
-from sgam_core.options import TurningOptions, ZoomOptions, changed
-from sgam_core.types import Image, PairResult
+from sgam_core.options import GuidanceOptions, TurningOptions, ZoomOptions, changed
+from sgam_core.types import Image, PairResult, TwoViewModel
 from sgam_sfm.matchers.xfeat import XFeatStar
 from tests.room import Room, TrueMatcher
 
@@ -83,20 +83,25 @@ PLAIN = Look(sizes=(900, 600))
 FAR, NEAR = Look(sizes=(300, 600)), Look(sizes=(900, 200))
 
 
-def chosen(found: dict[Look, int], agreeing: tuple[Look, ...] = (), **zoom) -> tuple[Look, list[Look]]:
+def chosen(found: dict[Look, int], **zoom) -> tuple[Look, list[Look]]:
     """The best look where those of `found` have so many inliers and others none, and all looks that were asked for."""
     asked = []
 
-    def inliers(looks):
-        asked.extend(looks)
-        return [found.get(look, 0) for look in looks]
+    def models(looks):
+        asked.extend(look for look in looks if look not in asked)
+        return [
+            TwoViewModel(F=np.eye(3), calibrated=False, num_inliers=n, num_matches=max(n, 100), planarity=0.0)
+            if (n := found.get(look, 0))
+            else None
+            for look in looks
+        ]
 
-    look = best_look(PLAIN, lambda look: look in agreeing, inliers, TurningOptions(), ZoomOptions(**zoom))
-    return look, asked
+    return best_look(PLAIN, models, TurningOptions(), ZoomOptions(**zoom), GuidanceOptions()), asked
 
 
 def test_images_that_agree_are_looked_at_once():
-    assert chosen({NEAR: 1000}, agreeing=(PLAIN,)) == (PLAIN, [])
+    assert chosen({PLAIN: 150, NEAR: 1000}) == (PLAIN, [PLAIN])
+    assert chosen({PLAIN: 149, NEAR: 1000}) == (NEAR, [PLAIN, FAR, NEAR])  # so well, sizes alone may be wrong
 
 
 def test_the_image_taken_from_near_is_made_smaller():
@@ -115,7 +120,8 @@ def test_a_turned_image_may_be_near_too():
     small = [Look(sizes=(512, 512), turns=turns) for turns in range(4)]
     turned = replace(NEAR, turns=1)
     assert chosen({small[1]: 30, turned: 50})[0] == turned
-    assert chosen({small[1]: 30}, agreeing=(replace(PLAIN, turns=1),)) == (replace(PLAIN, turns=1), small)
+    upright = replace(PLAIN, turns=1)
+    assert chosen({small[1]: 30, upright: 150}) == (upright, [PLAIN, *small, upright])
 
 
 def test_a_learned_matcher_sees_through_a_change_of_size(room):
