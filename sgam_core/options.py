@@ -249,7 +249,7 @@ class GuidanceOptions(_Checked):
     """So many consistent whole-image matches need no areas to find more evidence (0: areas always)."""
     sure_inlier_ratio: float = 0.5
     """And so large a share of all of them is consistent."""
-    min_inlier_ratio: float = 0.3
+    min_inlier_ratio: float = 0.35
     """Where a smaller share is, the images are taken to show different things, and nothing more is tried (0: it is)."""
     max_chance: float = 0.01
     """Where they do not agree, area pairs are matched that whole-image matches join more often than chance: the largest
