@@ -40,7 +40,7 @@ from sgam_sfm.images import read_image
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import LabelMaps, make_label_maps
 from sgam_sfm.machine import find_device, use_threads
-from sgam_sfm.matching import CollectionMatcher, create_area_matcher, create_matcher
+from sgam_sfm.matching import CollectionMatcher, create_area_matcher, create_matcher, reset
 from sgam_sfm.options import MatchOptions, with_preset
 from sgam_sfm.pairs import Pair, PairList, blocks, spread_over
 from sgam_sfm.progress import Stages
@@ -67,9 +67,7 @@ class TimedMatcher:
 
     def reset(self) -> None:
         """Forget what the point matcher has in memory."""
-        reset = getattr(self.matcher, "reset", None)
-        if reset is not None:
-            reset()
+        reset(self.matcher)
 
     def match(self, pairs: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
         """Match every pair of crops; see `PointMatcher.match`."""

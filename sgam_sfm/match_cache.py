@@ -16,7 +16,7 @@ from sgam_core import Crop, Matches, PointMatcher
 from sgam_core.errors import SGAMError
 from sgam_sfm.files import replacing
 from sgam_sfm.inputs import Inputs
-from sgam_sfm.matching import create_matcher
+from sgam_sfm.matching import create_matcher, reset
 from sgam_sfm.options import MatchOptions, as_json
 
 _log = logging.getLogger(__name__)
@@ -64,9 +64,7 @@ class CachedMatcher:
 
     def reset(self) -> None:
         """Forget what the point matcher has in memory."""
-        reset = getattr(self.matcher, "reset", None)
-        if reset is not None:
-            reset()
+        reset(self.matcher)
 
     @property
     def pixels_extracted(self) -> int:

@@ -53,6 +53,13 @@ def create_matcher(options: MatchOptions) -> PointMatcher:
     return matcher
 
 
+def reset(matcher: PointMatcher) -> None:
+    """Empty a point matcher's caches, where it has any."""
+    forget = getattr(matcher, "reset", None)
+    if forget is not None:
+        forget()
+
+
 def create_area_matcher(options: MatchOptions, ignored: Collection[int] = ()) -> AreaMatcher:
     """The area matcher that the options name; ignored: more labels that form no areas."""
     matcher: AreaMatcher = registry.create("area-matcher", options.area_matcher, options=options.sgam_ignoring(ignored))
@@ -144,16 +151,10 @@ class CollectionMatcher:
         Images of the pairs that follow are read while one is matched; not once a process of this run has been ended
         from outside, so that what a pair is told to have done was done for this pair.
         """
-        self._reset()
+        reset(self._point_matcher)
         names = () if crashes() else [name for pair in pairs for name in pair]
         with self.image.ahead(names):
             yield
-
-    def _reset(self) -> None:
-        """Empty the point matcher's caches, where it has any."""
-        reset = getattr(self._point_matcher, "reset", None)
-        if reset is not None:
-            reset()
 
     def match(self, pair: Pair) -> PairRecord:
         """The record of one pair; an error of its images becomes part of it.
@@ -190,7 +191,7 @@ class CollectionMatcher:
     def _empty_caches(self) -> None:
         import torch
 
-        self._reset()
+        reset(self._point_matcher)
         self.image.clear()
         self._description.cache_clear()
         if torch.cuda.is_available():
