@@ -49,7 +49,7 @@ def best_look(
             look = replace(plain, turns=best)
     if zoom.enabled and not agree(models([look])[0], zoom.sure_matches, guidance):
         large0, large1 = look.sizes
-        small0, small1 = (max(round(zoom.share * side), 1) for side in look.sizes)
+        small0, small1 = (max(round(side / zoom.factor), 1) for side in look.sizes)
         smaller = [replace(look, sizes=sizes) for sizes in ((small0, large1), (large0, small1))]
         found = _inliers(models([look, *smaller]))
         best = int(np.argmax(found[1:]))

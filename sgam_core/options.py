@@ -292,8 +292,8 @@ class ZoomOptions(_Checked):
     """Where whole images do not agree well, look whether they do once one of them is made smaller."""
     sure_matches: int = 150
     """So many consistent matches need no such look (0: always look)."""
-    share: float = 1 / 3
-    """Size of the smaller one, share of a whole image's at the matcher, 0.01 to 1."""
+    factor: float = 3.0
+    """How many times smaller than whole images are at the matcher, 1 to 100."""
     min_inliers: int = 25
     """Fewest consistent matches for a change of size."""
     min_lead: float = 1.5
@@ -301,7 +301,7 @@ class ZoomOptions(_Checked):
 
     def __post_init__(self) -> None:
         _Checked.__post_init__(self)
-        self._within("share", 0.01, 1)
+        self._within("factor", 1, 100)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sgam_core import SemanticAreaMatcher, SGAMOptions, WholeImages, match_described
+from sgam_core.errors import OptionError
 from sgam_core.geometry import residuals
 from sgam_core.looks import Look, best_look
 from sgam_core.options import GuidanceOptions, TurningOptions, ZoomOptions, changed
@@ -141,3 +142,8 @@ def test_a_learned_matcher_sees_through_a_change_of_size(room):
     plain = matched(room, XFeatStar(), changed(options, zoom__enabled=False), (image0, near))
     assert plain.two_view is None or right > 2 * plain.two_view.num_inliers
     assert right > 0.8 * len(found.matches) > 40
+
+
+def test_a_smaller_image_is_not_larger():
+    with pytest.raises(OptionError, match="factor is 0.5; expected a number from 1 to 100"):
+        ZoomOptions(factor=0.5)
