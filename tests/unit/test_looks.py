@@ -145,5 +145,5 @@ def test_a_learned_matcher_sees_through_a_change_of_size(room):
 
 
 def test_a_smaller_image_is_not_larger():
-    with pytest.raises(OptionError, match="factor is 0.5; expected a number from 1 to 100"):
+    with pytest.raises(OptionError, match=r"factor is 0\.5; expected a number from 1 to 100"):
         ZoomOptions(factor=0.5)
