@@ -18,8 +18,9 @@ Distances are in matcher pixels (image pixels / sigma), so that coarse and fine 
 only read: merging can be repeated with other options.
 
 Memory does not grow with the matches. They are kept in one file, a row each, which every step reads again, pair by pair
-or image by image; what must be in another order is sorted on disk. In memory are 40 bytes a keypoint and small records
-of images and pairs. Results do not depend on the order of the pairs, nor on the number of threads.
+or image by image; what must be in another order is sorted on disk. In memory are 24 bytes a keypoint, at times up to
+1 GiB more, and small records of images and pairs. Results do not depend on the order of the pairs, nor on the number of
+threads.
 """
 
 from __future__ import annotations

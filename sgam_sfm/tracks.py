@@ -20,12 +20,13 @@ from sgam_sfm.grid import cells_around, grid_of
 # image, minus 1, and a link to what it became part of. A track's root has minus its number of members as its parent.
 _PARENT, _LINK, _IMAGE, _X, _Y, _SIGMA = range(6)
 _COLUMNS = 6
+_MOST_REARRANGED = 2**26  # keypoints, which takes 1 GiB more: beyond, memory is worth more than time
 
 
 class Tracks:
     """Tracks of keypoints, each with at most one keypoint in an image; every keypoint is one of its own to begin with.
 
-    It takes 24 bytes a keypoint, 40 while tracks are joined with each other, and nothing for a match.
+    It takes 24 bytes a keypoint and nothing for a match; up to 1 GiB more while tracks are joined with each other.
 
     points (K, 2), images (K,), sigmas (K,): of the keypoints. radius: matcher pixels within which two keypoints of an
     image may become one.
@@ -85,7 +86,11 @@ class Tracks:
 
         min_shared: number of images that both tracks of an edge must be in.
         """
-        place = _track_by_track(self._rows)
+        if len(self._rows) > _MOST_REARRANGED:
+            for part in edges:
+                _join(self._rows, self._values, self._num_images, part, self._radius, min_shared)
+            return
+        place = _track_by_track(self._rows)  # those of a track next to each other are in reach of each other
         origin = np.empty_like(place)
         origin[place] = np.arange(len(place), dtype=np.int32)
         _rearrange(self._rows, place, origin)
