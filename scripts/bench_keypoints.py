@@ -22,7 +22,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sgam_core.types import Matches
-from sgam_sfm.database import CameraOptions, import_cameras, write_database
+from sgam_sfm.database import write_database
+from sgam_sfm.image_import import CameraOptions, import_cameras
 from sgam_sfm.keypoints import KeypointOptions
 from sgam_sfm.mapping import map_images, verify
 from sgam_sfm.merging import merge_keypoints

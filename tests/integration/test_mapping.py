@@ -15,12 +15,8 @@ import pytest
 
 from sgam_core.errors import InputError, OptionError, StageError
 from sgam_sfm.colmap_reading import database_content, read_database
-from sgam_sfm.database import (
-    CameraOptions,
-    ImportedImages,
-    import_cameras,
-    write_database,
-)
+from sgam_sfm.database import write_database
+from sgam_sfm.image_import import CameraOptions, ImportedImages, import_cameras
 from sgam_sfm.mapping import MappingOptions, VerificationOptions, map_images, verify
 
 NAMES = tuple(f"{i}.jpg" for i in range(6))
