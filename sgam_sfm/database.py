@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 
 from sgam_core.errors import InputError, ShapeError, StageError
+from sgam_sfm.colmap_reading import require_database
 from sgam_sfm.files import replacing, require_space
 from sgam_sfm.pairs import Pair
 
@@ -116,8 +117,7 @@ def backup(source: Path, target: Path) -> None:
 
     Raises: InputError when there is none; StageError when it cannot be read.
     """
-    if not source.is_file():
-        raise InputError(f"there is no database at {source}")
+    require_database(source)
     try:
         with closing(sqlite3.connect(source)) as old, closing(sqlite3.connect(target)) as new:
             old.backup(new)
