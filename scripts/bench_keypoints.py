@@ -22,11 +22,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sgam_core.types import Matches
-from sgam_sfm.database import CameraOptions, import_cameras, write_database
+from sgam_sfm.database import write_database
+from sgam_sfm.image_import import CameraOptions, import_cameras
 from sgam_sfm.keypoints import KeypointOptions
-from sgam_sfm.mapping import map_images, verify
+from sgam_sfm.mapping import map_images
 from sgam_sfm.merging import merge_keypoints
 from sgam_sfm.store import read_pairs_of
+from sgam_sfm.verification import verify
 
 Pair = tuple[str, str]
 

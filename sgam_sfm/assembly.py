@@ -20,17 +20,11 @@ from sgam_sfm.colmap_reading import read_camera_ids, read_counts, read_match_cou
 from sgam_sfm.hloc_files import matches_h5_size, write_keypoints_h5, write_matches_h5
 from sgam_sfm.images import read_image
 from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions
-from sgam_sfm.mapping import (
-    MappingOptions,
-    MappingSummary,
-    VerificationOptions,
-    VerificationSummary,
-    map_images,
-    verify,
-)
+from sgam_sfm.mapping import MappingOptions, MappingSummary, map_images
 from sgam_sfm.merging import Photos, RawPair, merging
 from sgam_sfm.progress import Advance, Stages
 from sgam_sfm.store import PairRecord
+from sgam_sfm.verification import VerificationOptions, VerificationSummary, verify
 
 _log = logging.getLogger(__name__)
 

@@ -234,12 +234,16 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
         ) from error
 
 
+def require_database(path: Path) -> None:
+    """Raises: InputError when there is no such file, which COLMAP would create and find empty."""
+    if not path.is_file():
+        raise InputError(f"there is no database at {path}")
+
+
 @contextmanager
 def opened(path: Path) -> Iterator[pycolmap.Database]:
     """An existing database. Raises: InputError when the file is missing or no COLMAP database."""
-    # COLMAP would create a missing file.
-    if not path.is_file():
-        raise InputError(f"there is no database at {path}")
+    require_database(path)
     try:
         database = pycolmap.Database.open(path)
     except RuntimeError as error:

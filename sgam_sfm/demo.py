@@ -8,9 +8,9 @@ from typing import Any
 from rich.console import Console
 
 from sgam_sfm.files import write_json
-from sgam_sfm.mapping import PoseErrors, compare_poses
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pictures import collection_picture, pair_picture, save_picture
+from sgam_sfm.pose_errors import PoseErrors, compare_poses
 from sgam_sfm.progress import Stages
 from sgam_sfm.results import open_results
 from sgam_sfm.runner import match_collection

@@ -27,13 +27,14 @@ from sgam_sfm.absolute_pose import (
     joined,
     landmarks_of,
 )
+from sgam_sfm.cameras import CameraInfo, camera_of_info
 from sgam_sfm.colmap_reading import read_model
-from sgam_sfm.database import CameraInfo, CameraOptions, camera_of_info, import_cameras
 from sgam_sfm.evaluation.ground_truth.camera_table import write_camera_table
 from sgam_sfm.evaluation.ground_truth.types import TrueView
 from sgam_sfm.executors import MatchingJob
 from sgam_sfm.executors.local import LocalExecutor
 from sgam_sfm.files import replacing, write_json
+from sgam_sfm.image_import import CameraOptions, import_cameras
 from sgam_sfm.images import inspect_image
 from sgam_sfm.inputs import Inputs, read_images
 from sgam_sfm.label_maps import make_label_maps

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from sgam_core import AreaMatcher, Image, PairResult, PointMatcher, WholeImages, match_described
 from sgam_core.errors import OptionError, SGAMError, StageError
 from sgam_sfm import registry
-from sgam_sfm.database import camera_matrix
+from sgam_sfm.cameras import camera_matrix
 from sgam_sfm.external import WorkerCommand
 from sgam_sfm.images import read_image, read_mask
 from sgam_sfm.inputs import Inputs

@@ -15,7 +15,7 @@ from sgam_sfm.database import copy_database, write_database
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import refuse_among_images
 from sgam_sfm.machine import use_threads
-from sgam_sfm.mapping import MappingOptions, VerificationOptions
+from sgam_sfm.mapping import MappingOptions
 from sgam_sfm.options import starting_options
 from sgam_sfm.progress import Stages
 from sgam_sfm.results import json_object, open_results
@@ -24,6 +24,7 @@ from sgam_sfm.runner import KNOWN_CAMERAS
 from sgam_sfm.stage_options import AggregateOptions, ReconstructOptions
 from sgam_sfm.store import read_pairs_of
 from sgam_sfm.summary import summarise_keypoints, versions
+from sgam_sfm.verification import VerificationOptions
 
 
 def reconstruct(options: ReconstructOptions, stages: Stages | None = None) -> dict[str, Any]:

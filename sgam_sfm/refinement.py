@@ -20,7 +20,7 @@ def refine(model: pycolmap.Reconstruction, pipeline: pycolmap.IncrementalPipelin
 
     Images that see too few others keep theirs. The loss is Cauchy's at the median error of the points; the other
     options of bundle adjustment are the mapper's own. Cameras stay as the mapper left them: on some paths around a
-    thing they can change a lot and fit as well. Runs in the child of `sgam_sfm.mapping`.
+    thing they can change a lot and fit as well. Runs in the child `sgam_sfm.mappers`.
     """
     images = {point_id: {seen.image_id for seen in point.track.elements} for point_id, point in model.points3D.items()}
     pairwise = {point_id: seen for point_id, seen in images.items() if len(seen) < 3}

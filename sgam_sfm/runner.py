@@ -19,7 +19,7 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import peak_memory_mb
-from sgam_sfm.mapping import MappingOptions, MappingSummary, VerificationOptions, VerificationSummary
+from sgam_sfm.mapping import MappingOptions, MappingSummary
 from sgam_sfm.matching import count_outcomes, create_area_matcher, match_blocks
 from sgam_sfm.options import NOT_IN_RESULTS, VERSION, MatchOptions, as_json, fingerprint
 from sgam_sfm.pairs import Pair, blocks
@@ -29,6 +29,7 @@ from sgam_sfm.run_record import recording
 from sgam_sfm.shards import Shard
 from sgam_sfm.store import PairStore
 from sgam_sfm.summary import CountedPairs, summarise_images, summarise_keypoints, summarise_pairs, versions
+from sgam_sfm.verification import VerificationOptions, VerificationSummary
 
 _log = logging.getLogger(__name__)
 _WITHOUT_EFFECT = frozenset({"output", "config", "threads", "verbose", "log_json", "accept_licence"})

@@ -12,8 +12,8 @@ from rich.table import Table
 
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.keypoints import CollectionKeypoints
-from sgam_sfm.mapping import VerificationSummary
 from sgam_sfm.store import PairRecord
+from sgam_sfm.verification import VerificationSummary
 
 _PACKAGES = ("sgam-sfm", "pycolmap", "torch", "kornia", "numpy", "numba", "opencv-python-headless", "onnxruntime")
 

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import zlib  # noqa: F401  (before pycolmap, whose wheel carries a zlib of its own: loaded later, ours would mix the two)
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pycolmap
 
 from sgam_core.errors import InputError
+from sgam_sfm.colmap_process import Progress
 from sgam_sfm.colmap_reading import opened, read_model
-
-if TYPE_CHECKING:
-    from sgam_sfm.mapping import MappingOptions
 
 
 def require_fitting(input_model: Path, database_path: Path) -> None:
@@ -52,16 +50,18 @@ def require_fitting(input_model: Path, database_path: Path) -> None:
             )
 
 
-def triangulated(job: Mapping[str, Any], options: MappingOptions, send: Callable[[str, int, int], None]) -> Any:
+def triangulated(
+    job: Mapping[str, Any], send: Progress, *, seed: int, threads: int, refine_intrinsics: bool
+) -> pycolmap.Reconstruction:
     """The job's input model with points from the verified matches of its database; images without a pose are left out.
 
-    Poses stay as they are, cameras too unless the options refine them. Ids are those of the database. Runs in the child
-    of `sgam_sfm.mapping`.
+    Poses stay as they are, cameras too unless `refine_intrinsics`. Ids are those of the database. Runs in the child
+    `sgam_sfm.mappers`.
     """
     known = pycolmap.Reconstruction(job["input_model"])
     pipeline = pycolmap.IncrementalPipelineOptions()
-    pipeline.random_seed = options.seed
-    pipeline.num_threads = options.threads
+    pipeline.random_seed = seed
+    pipeline.num_threads = threads
     send("triangulate", 0, 0)
     return pycolmap.triangulate_points(
         _with_ids_of(job["database"], known),
@@ -69,7 +69,7 @@ def triangulated(job: Mapping[str, Any], options: MappingOptions, send: Callable
         job["images"],
         job["output"],
         options=pipeline,
-        refine_intrinsics=options.refine_intrinsics,
+        refine_intrinsics=refine_intrinsics,
     )
 
 

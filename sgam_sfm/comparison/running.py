@@ -20,13 +20,14 @@ from sgam_sfm.files import write_json
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.logs import logging_to
-from sgam_sfm.mapping import VerificationOptions, match_sift
 from sgam_sfm.match_cache import CachedMatcher
 from sgam_sfm.matching import CollectionMatcher, create_area_matcher
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.progress import Stages
 from sgam_sfm.run_record import recording
 from sgam_sfm.runner import match_collection, reconstruct
+from sgam_sfm.sift_baseline import match_sift
+from sgam_sfm.verification import VerificationOptions
 
 _log = logging.getLogger(__name__)
 

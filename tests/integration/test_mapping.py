@@ -15,13 +15,10 @@ import pytest
 
 from sgam_core.errors import InputError, OptionError, StageError
 from sgam_sfm.colmap_reading import database_content, read_database
-from sgam_sfm.database import (
-    CameraOptions,
-    ImportedImages,
-    import_cameras,
-    write_database,
-)
-from sgam_sfm.mapping import MappingOptions, VerificationOptions, map_images, verify
+from sgam_sfm.database import write_database
+from sgam_sfm.image_import import CameraOptions, ImportedImages, import_cameras
+from sgam_sfm.mapping import MappingOptions, map_images
+from sgam_sfm.verification import VerificationOptions, verify
 
 NAMES = tuple(f"{i}.jpg" for i in range(6))
 WIDTH, HEIGHT, FOCAL, CX, CY = 640, 480, 520.0, 331.0, 229.5  # corner origin
@@ -262,7 +259,7 @@ def test_an_unguarded_script_can_verify(tmp_path):
     (tmp_path / "script").mkdir()
     script = tmp_path / "script/run.py"
     script.write_text(
-        "import sys, pathlib\nfrom sgam_sfm.mapping import verify\n"
+        "import sys, pathlib\nfrom sgam_sfm.verification import verify\n"
         "print(len(verify(pathlib.Path(sys.argv[1])).inliers))\n"
     )
     done = subprocess.run(
@@ -273,6 +270,6 @@ def test_an_unguarded_script_can_verify(tmp_path):
 
 def test_png_can_be_written_after_the_import():
     """pycolmap's wheel carries a zlib that breaks the system's when pycolmap is loaded first."""
-    code = "from sgam_sfm import database, mapping\nimport zlib\nprint(len(zlib.compress(b'abc' * 1000)) < 100)"
+    code = "from sgam_sfm import database, mappers\nimport zlib\nprint(len(zlib.compress(b'abc' * 1000)) < 100)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"

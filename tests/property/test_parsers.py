@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sgam_core.errors import SGAMError
-from sgam_sfm.database import read_cameras
+from sgam_sfm.camera_files import read_cameras
 from sgam_sfm.evaluation.ground_truth import FORMATS, read_ground_truth
 from sgam_sfm.hloc_files import read_global_descriptors, read_match_counts_h5
 from sgam_sfm.images import inspect_image, read_label_map

@@ -12,8 +12,9 @@ import pytest
 from sgam_core.errors import InputError
 from sgam_sfm import cli
 from sgam_sfm.colmap_text import write_keypoints_text, write_matches_text
-from sgam_sfm.database import import_cameras, write_database
+from sgam_sfm.database import write_database
 from sgam_sfm.exit_codes import DONE, ERROR
+from sgam_sfm.image_import import import_cameras
 
 KEYPOINTS = {
     "a.jpg": np.array([[0.5, 0.5], [1234.5678, 2.25]], np.float32),

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from sgam_core.errors import InputError, OptionError, StageError
-from sgam_sfm.database import CameraInfo
+from sgam_sfm.cameras import CameraInfo
 from sgam_sfm.executors import MatchingJob, open_executor, ray
 from sgam_sfm.images import ImageFile
 from sgam_sfm.inputs import Inputs

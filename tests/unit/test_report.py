@@ -24,8 +24,9 @@ from sgam_sfm.comparison.harder import Window
 from sgam_sfm.comparison.report import Bounds, geometry, plots, table, write_report
 from sgam_sfm.comparison.report.gallery import extremes, make_gallery, thumbnails
 from sgam_sfm.comparison.report.runs import MethodRun, PairFacts, read_matches, read_run
-from sgam_sfm.database import CameraOptions, import_cameras, write_database
+from sgam_sfm.database import write_database
 from sgam_sfm.evaluation.sfm_metrics import Similarity
+from sgam_sfm.image_import import CameraOptions, import_cameras
 from sgam_sfm.store import PairRecord, PairStore
 
 NAMES = ("\"&'.jpg", "<script>.jpg", "c.jpg", "sub/d.jpg")
