@@ -13,17 +13,18 @@ from jaxtyping import Bool, Float, Int32, UInt8
 
 from sgam_core.collection import collect, coverage, merge
 from sgam_core.covisible import Frame
-from sgam_core.crops import area_crop, box_crop, whole_crop
+from sgam_core.crops import area_crop
 from sgam_core.geometry import estimate_two_view, residuals
 from sgam_core.guidance import guided_areas
-from sgam_core.looks import Look, agree, best_look
+from sgam_core.looks import agree, best_look
 from sgam_core.options import CropOptions, SGAMOptions
+from sgam_core.point_matching import PairPoints
 from sgam_core.prediction import Estimate, MatchedArea, predict
 from sgam_core.protocols import AreaMatcher, PointMatcher
 from sgam_core.rejection import reject
 from sgam_core.semantic import SemanticAreaMatcher
 from sgam_core.support import supported
-from sgam_core.types import AreaMatch, AreaState, Box, Crop, Image, Matches, PairResult, PutativeAreas, TwoViewModel
+from sgam_core.types import AreaState, Image, Matches, PairResult, PutativeAreas, TwoViewModel
 
 
 def match_pair(
@@ -73,7 +74,7 @@ def match_described(
     from near are made smaller, and guided areas follow. Crops are those of `area_crop`, unless it has a method
     `crop(image, box, options)` of its own.
     """
-    points = _Points(image0, image1, point_matcher, options.crop, getattr(area_matcher, "crop", area_crop))
+    points = PairPoints(image0, image1, point_matcher, options.crop, getattr(area_matcher, "crop", area_crop))
     estimate = partial(
         estimate_two_view, camera0=image0.camera_matrix, camera1=image1.camera_matrix, options=options.geometry
     )
@@ -132,7 +133,7 @@ class _Found:
     final: bool = False
 
 
-def _plain(points: _Points, estimate: Estimate, options: SGAMOptions) -> _Found | None:
+def _plain(points: PairPoints, estimate: Estimate, options: SGAMOptions) -> _Found | None:
     """The whole images, where they agree so well or so little that areas have nothing to add; None elsewhere."""
     model = points.agreement(estimate)
     found = partial(_Found, matches=points.whole(), model=model)
@@ -153,7 +154,7 @@ def _evidence_crops(options: SGAMOptions) -> CropOptions:
 def _by_areas(
     putative: PutativeAreas,
     crop: CropOptions,
-    points: _Points,
+    points: PairPoints,
     estimate: Estimate,
     options: SGAMOptions,
     clock: _Clock,
@@ -179,7 +180,7 @@ def _by_areas(
     return found
 
 
-def _guided(first: _Found, points: _Points, estimate: Estimate, options: SGAMOptions) -> _Found | None:
+def _guided(first: _Found, points: PairPoints, estimate: Estimate, options: SGAMOptions) -> _Found | None:
     """A second, finer round where the first one agrees; None where there is nothing to gain, or it fails."""
     if first.model is None:
         return None
@@ -207,7 +208,7 @@ def _collected(
     areas: Sequence[MatchedArea],
     model: TwoViewModel | None,
     coarser: Callable[[], Matches],
-    points: _Points,
+    points: PairPoints,
     options: SGAMOptions,
     begin: int = 0,
 ) -> Matches:
@@ -219,7 +220,7 @@ def _collected(
     return merge(inside, collected, options.collection)
 
 
-def _coverages(areas: Sequence[MatchedArea], points: _Points) -> tuple[float, float]:
+def _coverages(areas: Sequence[MatchedArea], points: PairPoints) -> tuple[float, float]:
     """Share of each image inside the areas that are kept."""
     kept = [area.area for area in areas if area.area.state is AreaState.KEPT]
     image0, image1 = points.images
@@ -231,7 +232,7 @@ def _coverages(areas: Sequence[MatchedArea], points: _Points) -> tuple[float, fl
 
 def match_whole(image0: Image, image1: Image, point_matcher: PointMatcher, options: CropOptions) -> Matches:
     """Plain matches of two whole images, in image pixels."""
-    return _Points(image0, image1, point_matcher, options, area_crop).whole()
+    return PairPoints(image0, image1, point_matcher, options, area_crop).whole()
 
 
 class WholeImages:
@@ -254,161 +255,10 @@ def _final(area: MatchedArea, fallback: str) -> MatchedArea:
     return area
 
 
-class _Points:
-    """The point matcher's calls for one pair: whole images at most once, areas in one batch."""
-
-    def __init__(
-        self,
-        image0: Image,
-        image1: Image,
-        matcher: PointMatcher,
-        options: CropOptions,
-        area_crop: Callable[[Image, Box, CropOptions], Crop],
-    ) -> None:
-        self.images, self.matcher, self.options, self.area_crop = (image0, image1), matcher, options, area_crop
-        size0, size1 = (min(options.image_size, max(image.width, image.height)) for image in self.images)
-        self.look = Look(sizes=(size0, size1))
-        self.pixels = self.pixels_of_areas = 0
-        self.seconds = 0.0
-        self.notes: tuple[str, ...] = ()
-        self._seen: dict[Look, Matches] = {}
-        self._models: dict[Look, TwoViewModel | None] = {}
-
-    @property
-    def whole_is_known(self) -> bool:
-        return self.look in self._seen
-
-    def whole(self) -> Matches:
-        """Plain matches of the whole images."""
-        self._see([self.look])
-        return self._seen[self.look]
-
-    def agreement(self, estimate: Estimate) -> TwoViewModel | None:
-        """The geometry of the whole images."""
-        return self.models([self.look], estimate)[0]
-
-    def models(self, looks: Sequence[Look], estimate: Estimate) -> list[TwoViewModel | None]:
-        """The geometry of the whole images, seen in several ways."""
-        self._see(looks)
-        for look in looks:
-            if look not in self._models:
-                self._models[look] = estimate(self._seen[look])
-        return [self._models[look] for look in looks]
-
-    def whole_crops(self, look: Look) -> tuple[Crop, Crop]:
-        """What the matcher sees."""
-        crop0, crop1 = (
-            whole_crop(image, replace(self.options, image_size=size))
-            for image, size in zip(self.images, look.sizes, strict=True)
-        )
-        return crop0, crop1.turned(look.turns)
-
-    def _see(self, looks: Sequence[Look]) -> None:
-        """Match whole images, together, in those ways in which they have not been matched yet."""
-        missing = [look for look in looks if look not in self._seen]
-        self._seen |= zip(missing, self._match([self.whole_crops(look) for look in missing]), strict=True)
-
-    def inside(
-        self, putative: PutativeAreas, options: CropOptions, max_candidates: int
-    ) -> tuple[list[MatchedArea], list[list[MatchedArea]]]:
-        """Point matches inside all confident areas and the doubtful candidates that the limits allow."""
-        limited = _limit_candidates(putative.doubtful, max_candidates)
-        planned = [*putative.confident, *(candidate for group in limited for candidate in group)]
-        (image0, image1), crop, turns = self.images, self.area_crop, self.look.turns
-        crops = [
-            (crop(image0, a.area0.box, options), crop(image1, a.area1.box, options).turned(turns)) for a in planned
-        ]
-        chosen = self._within_budget(planned, crops, options.max_crop_pixels)
-        found = dict(zip(chosen, self._match([crops[k] for k in chosen]), strict=True))
-        areas = iter([self._matched(area, crops[k], found.get(k)) for k, area in enumerate(planned)])
-        confident = [next(areas) for _ in putative.confident]
-        return confident, [[next(areas) for _ in group] for group in limited]
-
-    def guided(self, areas: Sequence[AreaMatch]) -> list[MatchedArea]:
-        """Point matches inside areas that say themselves how finely they are cropped."""
-        (image0, image1), turns = self.images, self.look.turns
-        crops = [
-            (_scaled_crop(image0, a.area0.box, a.scale0), _scaled_crop(image1, a.area1.box, a.scale1).turned(turns))
-            for a in areas
-        ]
-        found = zip(areas, crops, self._match(crops), strict=True)
-        return [self._matched(area, pair, matches) for area, pair, matches in found]
-
-    def _within_budget(
-        self, planned: Sequence[AreaMatch], crops: Sequence[tuple[Crop, Crop]], max_pixels: int
-    ) -> list[int]:
-        """Rows to match: in order, until the pixel budget is spent."""
-        budget = max_pixels or float("inf")
-        spent, rows = 0, []
-        for k, (area, pair) in enumerate(zip(planned, crops, strict=True)):
-            if area.state is AreaState.SKIPPED:
-                continue
-            cost = sum(crop.size[0] * crop.size[1] for crop in pair)
-            if spent + cost <= budget:
-                spent += cost
-                rows.append(k)
-        self.pixels_of_areas += spent
-        waiting = sum(area.state is not AreaState.SKIPPED for area in planned) - len(rows)
-        if waiting:
-            self.notes += (f"{waiting} area matches beyond the pixel budget (max_crop_pixels)",)
-        return rows
-
-    def _matched(self, area: AreaMatch, crops: tuple[Crop, Crop], found: Matches | None) -> MatchedArea:
-        scales = {"scale0": crops[0].scale, "scale1": crops[1].scale}
-        if found is None:
-            reason = area.reason or "beyond the pixel budget (max_crop_pixels)"
-            skipped = replace(area, state=AreaState.SKIPPED, reason=reason, **scales)  # type: ignore[arg-type]
-            return MatchedArea(area=skipped, matches=Matches.empty())
-        inside = area.area0.box.enlarged(self.options.keep).contains(found.points0)
-        inside &= area.area1.box.enlarged(self.options.keep).contains(found.points1)
-        matches = found.select(inside)
-        counted = replace(area, num_matches=len(matches), **scales)  # type: ignore[arg-type]
-        return MatchedArea(area=counted, matches=matches)
-
-    def _match(self, crops: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
-        """Run the point matcher and bring its points to image pixels."""
-        if not crops:
-            return []
-        self.pixels += sum(crop.size[0] * crop.size[1] for pair in crops for crop in pair)
-        start = time.perf_counter()
-        matched = self.matcher.match(crops)
-        self.seconds += time.perf_counter() - start
-        return [
-            Matches(
-                points0=crop0.to_image(found.points0),
-                points1=crop1.to_image(found.points1),
-                scores=found.scores,
-                sigmas0=found.sigmas0 / np.float32(crop0.scale),
-                sigmas1=found.sigmas1 / np.float32(crop1.scale),
-            )
-            for (crop0, crop1), found in zip(crops, matched, strict=True)
-        ]
-
-
-def _scaled_crop(image: Image, box: Box, scale: float) -> Crop:
-    return box_crop(image, box, max(round(scale * max(box.width, box.height)), 1), upsample=False)
-
-
-def _limit_candidates(groups: Sequence[Sequence[AreaMatch]], max_candidates: int) -> list[list[AreaMatch]]:
-    """The groups with the candidates beyond the limit marked as skipped, the farthest in descriptor distance first."""
-    distances = sorted(
-        (c.distance, g, k)
-        for g, group in enumerate(groups)
-        for k, c in enumerate(group)
-        if c.state is not AreaState.SKIPPED
-    )
-    dropped = {(g, k) for _, g, k in distances[max_candidates:]}
-    reason = "GP: limit of candidate pairs (max_candidates)"
-    return [
-        [replace(c, state=AreaState.SKIPPED, reason=reason) if (g, k) in dropped else c for k, c in enumerate(group)]
-        for g, group in enumerate(groups)
-    ]
-
-
 class _Clock:
     """Seconds by stage; the point matcher's are told apart, whichever stage called it."""
 
-    def __init__(self, points: _Points) -> None:
+    def __init__(self, points: PairPoints) -> None:
         self._points = points
         self._last = self._now()
         self.seconds: dict[str, float] = {}
