@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import fields
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -67,6 +68,9 @@ _REFUSALS = {
 def run(arguments: Sequence[str]) -> int:
     """Run a command line and return its exit code; usage errors and `--help` leave by SystemExit (2 and 0)."""
     console = Console(stderr=True)
+    if list(arguments) == ["--version"]:
+        print(version("sgam-sfm"))
+        return DONE
     try:
         options = _parse(arguments)
         command = import_module(f"sgam_sfm.commands.{_COMMANDS[type(options)]}")

@@ -90,7 +90,8 @@ class LabelSet:
         if all(part.isdecimal() for part in text.split()):
             raise OptionError(f"{flag} '{text}': separate labels by commas, '{','.join(text.split())}'")
         if not by_name:
-            hint = ", or --label-names what they are" if self.segmenter == "labels" else ""
+            own = self.segmenter == "labels"
+            hint = ", or --label-names what they are" if own else ", or take a --segmenter that names them, like ade20k"
             raise OptionError(f"{flag} '{text}': labels of '{self.segmenter}' have no names; give ids{known}{hint}")
         near = did_you_mean(text.lower(), by_name)
         listed = ", ".join(sorted({label.name.strip().lower() for label in self.labels if label.name}))

@@ -47,6 +47,8 @@ def _map(job: dict[str, Any], send: Progress) -> dict[str, Any]:
         f"best with {max(verified, default=0)} inliers; try pairs that overlap more (`sgam-sfm show OUT` draws them), "
         "a larger --image-size, or another --matcher"
     )
+    if len(verified) == 1:
+        reason = f"one verified pair is no model: COLMAP starts at {options.min_model_size} images; give more photos"
     if options.mapper != "triangulate":
         for model in models:
             refine(model, _incremental_options(options, fixed))

@@ -48,7 +48,9 @@ def read_status(output: Path) -> RunStatus:
     run = read_run_record(output)
     if run is None:
         what = "holds no run of sgam-sfm" if output.is_dir() else "does not exist"
-        raise InputError(f"'{output}' {what}; give the --output folder of `sgam-sfm match`")
+        inner = [path.parent for path in sorted(output.glob("*/options.json"))]
+        hint = f"did you mean '{inner[0]}'?" if inner else "give the --output folder of `sgam-sfm match`"
+        raise InputError(f"'{output}' {what}; {hint}")
     inputs = _read_json(output / "inputs.json") or {}
     fallbacks: Counter[str] = Counter()
     failed: dict[str, str] = {}
@@ -69,6 +71,7 @@ def read_status(output: Path) -> RunStatus:
                 failed[" - ".join(outcome.pair)] = outcome.error
             elif outcome.fallback:
                 fallbacks[outcome.fallback.partition(":")[0]] += 1
+    options, ended = output / "options.json", run.state in ("running", "done")
     return RunStatus(
         run=run,
         images=len(inputs["images"]) if inputs else None,
@@ -82,7 +85,7 @@ def read_status(output: Path) -> RunStatus:
         heartbeat_seconds=(datetime.now(UTC) - datetime.fromisoformat(run.updated)).total_seconds(),
         fallbacks=dict(sorted(fallbacks.items())),
         summary=_read_json(output / "summary.json") if run.state == "done" else None,
-        next="" if run.state in ("running", "done") else f"sgam-sfm match --config '{output / 'options.json'}'",
+        next=f"sgam-sfm match --config '{options}'" if options.exists() and not ended else "",
     )
 
 

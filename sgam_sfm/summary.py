@@ -121,10 +121,11 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     table = Table(show_header=False, box=None)
     table.add_row("images", f"{images['used']} used, {len(images['failed'])} failed")
     dropped = sum(pairs[reason] for reason in ("repeated", "reversed", "self"))
+    told = f"; {dropped} lines dropped that repeat or reverse a pair, or name an image twice" if dropped else ""
     table.add_row(
         "pairs",
         f"{pairs['matched']} matched, {len(pairs['failed']) + pairs['of_unusable_images']} failed, "
-        f"{pairs['verified']} verified" + (f"; {dropped} repeated or reversed lines dropped" if dropped else ""),
+        f"{pairs['verified']} verified{told}",
     )
     if summary["labels"].get("num_labels_chosen"):
         stability = summary["labels"]["stability"][str(summary["labels"]["num_labels_chosen"])]
@@ -143,6 +144,9 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     if summary["labels"]:
         told = ", ".join(f"{count} pairs: {reason}" for reason, count in pairs["fallbacks"].items())
         table.add_row("fallbacks", f"matched as whole images: {told}" if told else "none")
+    if pairs["pairs_turned"] or pairs["pairs_zoomed"]:
+        text = f"{pairs['pairs_turned']} pairs with an image sideways, {pairs['pairs_zoomed']} with one from nearer"
+        table.add_row("looks", text)
     if pairs["pairs_with_limits"]:
         table.add_row("limits", f"reached in {pairs['pairs_with_limits']} pairs (`sgam-sfm show` tells which)")
     table.add_row("matches", f"{pairs['raw_matches']} raw, {summary['keypoints']['matches']} as tracks")

@@ -85,6 +85,7 @@ def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
     inputs = read_inputs(common, stages)
     names = truth.match_names(inputs.images)
     pairs = _known(inputs.pairs.pairs, truth, names, options.max_pairs)
+    _require_true_sizes(inputs, truth, {name: names[name] for pair in pairs for name in pair})
     variants = _variants(common, ablation=options.ablation)
     needs_labels = any(create_area_matcher(variant.options).needs_labels for variant in variants)
     needs_labels |= bool(common.mask_matches)
@@ -213,6 +214,17 @@ def _known(pairs: Sequence[Pair], truth: GroundTruth, names: Mapping[str, str], 
             f"named like '{min(truth.views, default='-')}', the first pair is '{pairs[0][0]}' - '{pairs[0][1]}'"
         )
     return spread_over(known, wanted)
+
+
+def _require_true_sizes(inputs: Inputs, truth: GroundTruth, names: Mapping[str, str]) -> None:
+    """Raises: InputError for an image that the true camera, which is one of pixels, does not belong to."""
+    for name, true_name in names.items():
+        image, view = inputs.images[name], truth.views[true_name]
+        if (image.width, image.height) != (view.width, view.height):
+            raise InputError(
+                f"'{name}' has {image.width}x{image.height} pixels, its camera in '{truth.source}' ({truth.format}) is "
+                f"of {view.width}x{view.height}; evaluate images of that size"
+            )
 
 
 def _views(truth: GroundTruth, names: Mapping[str, str], pair: Pair) -> tuple[TrueView, TrueView]:

@@ -190,6 +190,19 @@ def test_evaluate_without_a_known_pose_says_how_names_differ(folder, tmp_path, c
     assert "its images are named like 'view02.jpg', the first pair is 'other0.jpg' - 'other1.jpg'" in error
 
 
+def test_evaluate_refuses_images_that_the_true_cameras_do_not_fit(folder, tmp_path, capsys):
+    images = tmp_path / "images"
+    images.mkdir()
+    for name in ("view02.jpg", "view03.jpg"):
+        with PIL.Image.open(folder / "images" / name) as image:
+            image.resize((320, 240)).save(images / name)
+    command = ["--images", str(images), "--ground-truth", str(folder / "truth"), "--output", str(tmp_path / "out")]
+    assert cli.run(["evaluate", *command, "--area-matcher", "none"]) == ERROR
+    error = capsys.readouterr().err
+    assert "'view02.jpg' has 320x240 pixels, its camera in" in error
+    assert "is of 640x480; evaluate images of that size" in error
+
+
 def test_an_unknown_data_set_is_told_with_the_nearest(folder, tmp_path, capsys):
     assert cli.run(["evaluate", *common(folder, tmp_path / "out"), "--dataset", "scanet"]) == USAGE
     assert (

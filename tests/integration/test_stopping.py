@@ -125,7 +125,19 @@ def test_status_of_a_finished_run_and_of_no_run(folder, tmp_path, capsys):
     assert status["run"]["state"] == "done"
     assert (status["images"], status["labels"], status["pairs"], status["pairs_done"]) == (6, 6, 15, 15)
     assert status["summary"]["pairs"]["verified"] > 3
+    assert cli.run(["status", str(tmp_path)]) == ERROR
+    assert f"'{tmp_path}' holds no run of sgam-sfm; did you mean '{output}'?" in capsys.readouterr().err
     assert cli.run(["status", str(tmp_path / "nowhere")]) == ERROR
     assert f"'{tmp_path}/nowhere' does not exist; give the --output folder of `sgam-sfm match`" in (
         capsys.readouterr().err
     )
+
+
+def test_status_of_a_run_that_did_not_begin_names_no_command_that_goes_on(tmp_path, capsys):
+    output = tmp_path / "out"
+    assert cli.run(["match", "--images", str(tmp_path / "nowhere"), "--output", str(output)]) == ERROR
+    capsys.readouterr()
+    assert cli.run(["status", str(output)]) == DONE
+    status = capsys.readouterr().out
+    assert status.startswith("state      failed")
+    assert "next" not in status

@@ -31,7 +31,10 @@ def test_names_for_labels_that_have_none():
     nameless = replace(NAMED, segmenter="coseg", labels=(Label(id=1), Label(id=14)))
     with pytest.raises(OptionError) as error:
         nameless.ids("sky", "--mask-matches")
-    assert str(error.value) == "--mask-matches 'sky': labels of 'coseg' have no names; give ids from 1 to 14"
+    assert str(error.value) == (
+        "--mask-matches 'sky': labels of 'coseg' have no names; give ids from 1 to 14, "
+        "or take a --segmenter that names them, like ade20k"
+    )
     with pytest.raises(OptionError, match=r"have no names; give ids, or --label-names what they are$"):
         LabelSet().ids("sky", "--mask-matches")
 

@@ -1,6 +1,7 @@
 """Options from files: misspelt, of another type, of another version; what options.json holds."""
 
 import json
+from importlib.metadata import version
 from pathlib import Path
 from typing import get_args
 
@@ -8,6 +9,8 @@ import pytest
 
 from sgam_core import PRESETS
 from sgam_core.errors import OptionError
+from sgam_sfm import cli
+from sgam_sfm.exit_codes import DONE
 from sgam_sfm.options import VERSION, MatchOptions, Preset, as_json, fingerprint, starting_options
 
 
@@ -94,3 +97,8 @@ def test_results_follow_from_images_not_from_where_they_are(tmp_path):
     assert fingerprint(here, images={"x": "1"}) != fingerprint(here, images={"x": "2"})
     assert fingerprint(here) != fingerprint(MatchOptions(images=Path("a"), output=Path("out"), seed=1))
     assert fingerprint(here) != fingerprint(MatchOptions(images=Path("a"), output=Path("out"), precision="full"))
+
+
+def test_the_version_is_told(capsys):
+    assert cli.run(["--version"]) == DONE
+    assert capsys.readouterr().out == f"{version('sgam-sfm')}\n"
