@@ -373,9 +373,11 @@ FAST = changed(
     semantic__intersections__enabled=False,
     prediction__max_candidates=3,
     guidance__min_gain=1.2,
+    turning__enabled=False,
+    zoom__enabled=False,
 )
-"""At most half more time than whole images take: few areas, where whole images do not agree, and a second round only
-where it is a fifth finer."""
+"""At most half more time than whole images take: few areas, where whole images do not agree, a second round only where
+it is a fifth finer, and no look at photos turned or made smaller."""
 
 PRESETS: Mapping[str, SGAMOptions] = MappingProxyType(
     {"default": SGAMOptions(), "fast": FAST, "paper": PAPER, "scannet": SCANNET, "outdoor": OUTDOOR}
