@@ -44,16 +44,14 @@ def best_look(
     if turning.enabled and not agree(models([look])[0], guidance.sure_matches, guidance):
         size = turning.image_size
         found = _inliers(models([Look(sizes=(size, size), turns=turns) for turns in range(4)]))
-        best = int(np.argmax(found))
-        if found[best] >= max(turning.min_inliers, turning.min_lead * found[0]):
+        if (best := _clearly_best(found, found[0], turning)) is not None:
             look = replace(plain, turns=best)
     if zoom.enabled and not agree(models([look])[0], zoom.sure_matches, guidance):
         large0, large1 = look.sizes
         small0, small1 = (max(round(side / zoom.factor), 1) for side in look.sizes)
         smaller = [replace(look, sizes=sizes) for sizes in ((small0, large1), (large0, small1))]
-        found = _inliers(models([look, *smaller]))
-        best = int(np.argmax(found[1:]))
-        if found[1 + best] >= max(zoom.min_inliers, zoom.min_lead * found[0]):
+        unchanged, *found = _inliers(models([look, *smaller]))
+        if (best := _clearly_best(found, unchanged, zoom)) is not None:
             look = smaller[best]
     return look
 
@@ -63,6 +61,12 @@ def agree(model: TwoViewModel | None, sure_matches: int, guidance: GuidanceOptio
     if model is None or not sure_matches:
         return False
     return model.num_inliers >= sure_matches and model.inlier_ratio >= guidance.sure_inlier_ratio
+
+
+def _clearly_best(inliers: Sequence[int], unchanged: int, options: TurningOptions | ZoomOptions) -> int | None:
+    """The row with most inliers, where they are enough against those of the images as they are; None where not."""
+    best = int(np.argmax(inliers))
+    return best if inliers[best] >= max(options.min_inliers, options.min_lead * unchanged) else None
 
 
 def _inliers(models: Sequence[TwoViewModel | None]) -> list[int]:

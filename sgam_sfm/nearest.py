@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from pathlib import Path
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """`did you mean 'x'? ` with the nearest of the known names; empty when none is near."""
     near = difflib.get_close_matches(name, list(known), n=1)
     return f"did you mean '{near[0]}'? " if near else ""
+
+
+def did_you_mean_run(folder: Path, otherwise: str) -> str:
+    """`did you mean 'x'?` with the first run inside a folder that is none itself; `otherwise` when there is none."""
+    runs = sorted(path.parent for path in folder.glob("*/options.json"))
+    return f"did you mean '{runs[0]}'?" if runs else otherwise

@@ -26,6 +26,7 @@ from sgam_sfm.colmap_reading import (
 )
 from sgam_sfm.images import MAX_IMAGE_SIZE, printable, read_image, read_label_map
 from sgam_sfm.label_set import read_label_set
+from sgam_sfm.nearest import did_you_mean_run
 from sgam_sfm.pairs import Pair
 from sgam_sfm.store import PairRecord, PairStore, read_pair_outcomes
 
@@ -188,8 +189,7 @@ def open_results(folder: Path, images: Path | None = None) -> Results:
         raise InputError(f"'{folder}' {'is a file' if folder.exists() else 'does not exist'}; {_EXPECTED}")
     options = json_object(folder / "options.json")
     if "images" not in options:
-        inner = [path.parent for path in sorted(folder.glob("*/options.json"))]
-        hint = f"did you mean '{inner[0]}'?" if inner else _EXPECTED
+        hint = did_you_mean_run(folder, _EXPECTED)
         raise InputError(f"'{folder}' is no result folder (no options.json of a run in it); {hint}")
     image_folder = images or Path(options["images"])
     if not image_folder.is_dir():

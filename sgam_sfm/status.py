@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sgam_core.errors import InputError
+from sgam_sfm.nearest import did_you_mean_run
 from sgam_sfm.run_record import RunRecord, read_run_record
 from sgam_sfm.store import read_outcomes
 
@@ -48,8 +49,7 @@ def read_status(output: Path) -> RunStatus:
     run = read_run_record(output)
     if run is None:
         what = "holds no run of sgam-sfm" if output.is_dir() else "does not exist"
-        inner = [path.parent for path in sorted(output.glob("*/options.json"))]
-        hint = f"did you mean '{inner[0]}'?" if inner else "give the --output folder of `sgam-sfm match`"
+        hint = did_you_mean_run(output, "give the --output folder of `sgam-sfm match`")
         raise InputError(f"'{output}' {what}; {hint}")
     inputs = _read_json(output / "inputs.json") or {}
     fallbacks: Counter[str] = Counter()
