@@ -42,17 +42,14 @@ def best_look(
     """
     look = plain
     if turning.enabled and not agree(models([look])[0], guidance.sure_matches, guidance):
-        size = turning.image_size
-        found = _inliers(models([Look(sizes=(size, size), turns=turns) for turns in range(4)]))
-        if (best := _clearly_best(found, found[0], turning)) is not None:
-            look = replace(plain, turns=best)
+        upright, *turned = (Look(sizes=(turning.image_size, turning.image_size), turns=turns) for turns in range(4))
+        if (best := _clearly_best(turned, upright, models, turning)) is not None:
+            look = replace(plain, turns=best.turns)
     if zoom.enabled and not agree(models([look])[0], zoom.sure_matches, guidance):
         large0, large1 = look.sizes
         small0, small1 = (max(round(side / zoom.factor), 1) for side in look.sizes)
         smaller = [replace(look, sizes=sizes) for sizes in ((small0, large1), (large0, small1))]
-        unchanged, *found = _inliers(models([look, *smaller]))
-        if (best := _clearly_best(found, unchanged, zoom)) is not None:
-            look = smaller[best]
+        look = _clearly_best(smaller, look, models, zoom) or look
     return look
 
 
@@ -63,10 +60,18 @@ def agree(model: TwoViewModel | None, sure_matches: int, guidance: GuidanceOptio
     return model.num_inliers >= sure_matches and model.inlier_ratio >= guidance.sure_inlier_ratio
 
 
-def _clearly_best(inliers: Sequence[int], unchanged: int, options: TurningOptions | ZoomOptions) -> int | None:
-    """The row with most inliers, where they are enough against those of the images as they are; None where not."""
-    best = int(np.argmax(inliers))
-    return best if inliers[best] >= max(options.min_inliers, options.min_lead * unchanged) else None
+def _clearly_best(
+    looks: Sequence[Look],
+    unchanged: Look,
+    models: Callable[[Sequence[Look]], Sequence[TwoViewModel | None]],
+    options: TurningOptions | ZoomOptions,
+) -> Look | None:
+    """The look with most inliers, where they are enough against those of the images unchanged; None where not."""
+    found = _inliers(models(looks))
+    best = int(np.argmax(found))
+    if found[best] < options.min_inliers:  # of most pairs: the images unchanged need not be matched at this size
+        return None
+    return looks[best] if found[best] >= options.min_lead * _inliers(models([unchanged]))[0] else None
 
 
 def _inliers(models: Sequence[TwoViewModel | None]) -> list[int]:

@@ -82,6 +82,7 @@ def test_a_learned_matcher_finds_sideways_what_it_finds_upright(room):
 
 PLAIN = Look(sizes=(900, 600))
 FAR, NEAR = Look(sizes=(300, 600)), Look(sizes=(900, 200))
+SMALL = [Look(sizes=(512, 512), turns=turns) for turns in range(4)]
 
 
 def chosen(found: dict[Look, int], **zoom) -> tuple[Look, list[Look]]:
@@ -118,11 +119,16 @@ def test_a_smaller_image_must_find_clearly_more():
 
 
 def test_a_turned_image_may_be_near_too():
-    small = [Look(sizes=(512, 512), turns=turns) for turns in range(4)]
     turned = replace(NEAR, turns=1)
-    assert chosen({small[1]: 30, turned: 50})[0] == turned
+    assert chosen({SMALL[1]: 30, turned: 50})[0] == turned
     upright = replace(PLAIN, turns=1)
-    assert chosen({small[1]: 30, upright: 150}) == (upright, [PLAIN, *small, upright])
+    assert chosen({SMALL[1]: 30, upright: 150}) == (upright, [PLAIN, *SMALL[1:], SMALL[0], upright])
+
+
+def test_a_turned_image_must_find_clearly_more():
+    assert chosen({SMALL[2]: 30, SMALL[0]: 16})[0] == PLAIN
+    assert chosen({SMALL[2]: 30, SMALL[0]: 15})[0] == replace(PLAIN, turns=2)
+    assert SMALL[0] not in chosen({SMALL[2]: 24})[1]  # as few as chance finds: nothing to compare with
 
 
 def test_a_learned_matcher_sees_through_a_change_of_size(room):
