@@ -11,18 +11,19 @@ from pathlib import Path
 from typing import Any
 
 from sgam_core.errors import InputError, OptionError
+from sgam_sfm.differences import Told, difference
 from sgam_sfm.executors import MatchingJob
 from sgam_sfm.files import replacing
 from sgam_sfm.inputs import read_inputs, refuse_among_images
 from sgam_sfm.label_maps import LabelMaps
 from sgam_sfm.label_set import RECORD, read_label_set
 from sgam_sfm.machine import use_threads
-from sgam_sfm.options import MatchOptions, as_json, starting_options
+from sgam_sfm.options import MatchOptions, starting_options
 from sgam_sfm.pairs import Pair, blocks
 from sgam_sfm.progress import Stages
 from sgam_sfm.results import json_object, open_results
 from sgam_sfm.run_record import recording
-from sgam_sfm.runner import assemble, difference, open_store, stamp_of_existing
+from sgam_sfm.runner import assemble, open_store, stamp_of_existing
 from sgam_sfm.shards import Shard
 from sgam_sfm.stage_options import JoinOptions
 from sgam_sfm.store import PairStore
@@ -79,8 +80,8 @@ def join(options: JoinOptions, stages: Stages | None = None) -> dict[str, Any]:
         store = open_store(run, inputs)
         if store.fingerprint != parts[0].store.fingerprint:
             raise InputError(
-                f"the shards were matched with other {difference(parts[0].options, as_json(run))}; put back what they "
-                "were matched with, or match them again"
+                f"the shards were matched with other {difference(_told(parts[0].folder), _told(run.output))}; put back "
+                "what they were matched with, or match them again"
             )
         with stages.stage("Joining shards", len(work)) as advance:
             for number, part in enumerate(sources):
@@ -113,13 +114,17 @@ def _again(folder: Path) -> str:
     return f"start it again: `sgam-sfm match --config '{folder / 'options.json'}'`"
 
 
+def _told(folder: Path) -> Told:
+    return json_object(folder / "options.json"), json_object(folder / "inputs.json")
+
+
 def _require_one_run(parts: Sequence[_Part]) -> None:
     """Raises: OptionError when the shards were matched with other inputs or options, or are of another number."""
     first = parts[0]
     for part in parts[1:]:
         if part.options["fingerprint"] != first.options["fingerprint"]:
             raise OptionError(
-                f"'{part.folder}' was matched with other {difference(first.options, part.options)} than "
+                f"'{part.folder}' was matched with other {difference(_told(first.folder), _told(part.folder))} than "
                 f"'{first.folder}'; join shards of one run"
             )
         if part.shard.count != first.shard.count:

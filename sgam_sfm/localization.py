@@ -27,6 +27,7 @@ from sgam_sfm.absolute_pose import (
     joined,
     landmarks_of,
 )
+from sgam_sfm.block_matching import match_blocks
 from sgam_sfm.cameras import CameraInfo, camera_of_info
 from sgam_sfm.colmap_reading import read_model
 from sgam_sfm.evaluation.ground_truth.camera_table import write_camera_table
@@ -39,7 +40,7 @@ from sgam_sfm.images import inspect_image
 from sgam_sfm.inputs import Inputs, read_images
 from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.machine import find_device
-from sgam_sfm.matching import create_area_matcher, match_blocks
+from sgam_sfm.matching import create_area_matcher
 from sgam_sfm.options import MatchOptions, starting_options
 from sgam_sfm.pairs import PairList, blocks, read_pairs
 from sgam_sfm.progress import Stages

@@ -1,13 +1,13 @@
-"""Match the pairs of a collection, block by block, into the store."""
+"""Match the pairs of a collection: images and label maps of two names in, the record of the pair out."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sgam_core import AreaMatcher, Image, PairResult, PointMatcher, WholeImages, match_described
 from sgam_core.errors import OptionError, SGAMError, StageError
@@ -21,13 +21,9 @@ from sgam_sfm.machine import out_of_memory
 from sgam_sfm.models import require_licence
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
-from sgam_sfm.progress import Stages
 from sgam_sfm.read_ahead import ReadAhead
-from sgam_sfm.store import PairRecord, PairStore, read_outcomes
+from sgam_sfm.store import PairRecord
 from sgam_sfm.supervised import crashes
-
-if TYPE_CHECKING:
-    from sgam_sfm.executors import Executor, MatchingJob
 
 _log = logging.getLogger(__name__)
 _DESCRIPTIONS_IN_MEMORY = 1024  # about 1 MB each
@@ -66,38 +62,6 @@ def create_area_matcher(options: MatchOptions, ignored: Collection[int] = ()) ->
     return matcher
 
 
-def match_blocks(
-    work: Sequence[Sequence[Pair]],
-    store: PairStore,
-    executor: Executor,
-    job: MatchingJob,
-    stages: Stages,
-    numbers: Collection[int] | None = None,
-) -> dict[str, float]:
-    """Match every block that the store does not hold yet, and give the seconds that each step took, of all workers.
-
-    A block follows from its pairs and the options alone: the point matcher starts each one with empty caches, so that
-    what it did before cannot decide how it batches.
-
-    Args: numbers: of the blocks to see to; all of them by default.
-    """
-    wanted = range(len(work)) if numbers is None else numbers
-    kept = {number for number in wanted if store.has(number, work[number])}
-    count_outcomes(stages, store, kept)
-    done = sum(len(work[number]) for number in kept)
-    seconds: dict[str, float] = {}
-    with stages.stage("Matching pairs", sum(len(work[number]) for number in wanted), done) as advance:
-        waiting = [(number, work[number]) for number in wanted if number not in kept]
-        for number, records in executor.run(job, waiting, advance, stages.working_on):
-            store.write(number, records)
-            for record in records:
-                result = record.result
-                stages.counts.update(_counted(record.error, result.fallback if result else ""))
-                for step, spent in (result.seconds if result else {}).items():
-                    seconds[step] = seconds.get(step, 0.0) + spent
-    return seconds
-
-
 def special_labels(options: MatchOptions, labels: LabelMaps | None) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """The labels that form no areas, and those that nothing is matched in.
 
@@ -107,20 +71,6 @@ def special_labels(options: MatchOptions, labels: LabelMaps | None) -> tuple[tup
         return (), ()
     ignored = (*labels.set.ignored, *labels.set.ids(options.ignore_labels, "--ignore-labels"))
     return ignored, labels.set.ids(options.mask_matches, "--mask-matches")
-
-
-def count_outcomes(stages: Stages, store: PairStore, blocks: Iterable[int]) -> None:
-    """Count how the pairs of blocks that are done have ended."""
-    for block in blocks:
-        for outcome in read_outcomes(store.path(block)):
-            stages.counts.update(_counted(outcome.error, outcome.fallback))
-
-
-def _counted(error: str, fallback: str) -> tuple[str, ...]:
-    """How a pair ended, in the words of heartbeats."""
-    if error:
-        return ("pairs_failed",)
-    return ("pairs_done", "fallbacks") if fallback else ("pairs_done",)
 
 
 def failed_record(pair: Pair, reason: str) -> PairRecord:

@@ -12,7 +12,9 @@ from sgam_core import PointMatcher
 from sgam_core.errors import OptionError
 from sgam_sfm.appending import Stamp, append_to_database, replace_database, stamp_of
 from sgam_sfm.assembly import build_models, merged_records, verify_pairs, write_for_hloc
+from sgam_sfm.block_matching import count_outcomes, match_blocks
 from sgam_sfm.database import is_whole, write_database
+from sgam_sfm.differences import difference
 from sgam_sfm.executors import MatchingJob, open_executor
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import Inputs, read_inputs
@@ -20,8 +22,8 @@ from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import peak_memory_mb
 from sgam_sfm.mapping import MappingOptions, MappingSummary
-from sgam_sfm.matching import count_outcomes, create_area_matcher, match_blocks
-from sgam_sfm.options import NOT_IN_RESULTS, VERSION, MatchOptions, as_json, fingerprint
+from sgam_sfm.matching import create_area_matcher
+from sgam_sfm.options import MatchOptions, as_json, fingerprint
 from sgam_sfm.pairs import Pair, blocks
 from sgam_sfm.progress import Stages
 from sgam_sfm.results import json_object
@@ -184,16 +186,15 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
     """
     mark = fingerprint(options, images=inputs.digests, pairs=inputs.pairs.pairs, cameras=inputs.cameras)
     path = options.output / "options.json"
-    now = as_json(options) | {"fingerprint": mark}
+    now, known = as_json(options) | {"fingerprint": mark}, _as_json(inputs)
     if path.exists():
         before = json_object(path)
         if not before:
             _log.warning("'%s' is damaged, and is written anew", path)
         if before.get("fingerprint") != mark:
             if before and any((options.output / "pairs").glob("*.h5")):
-                raise OptionError(
-                    f"'{options.output}' was begun with other {difference(before, now)}; choose a new --output folder"
-                )
+                other = difference((before, json_object(options.output / "inputs.json")), (now, known))
+                raise OptionError(f"'{options.output}' was begun with other {other}; choose a new --output folder")
             (options.output / "labels" / RECORD).unlink(missing_ok=True)  # they follow from the options too
         other = before.get("shard", "")
         if options.shard and other not in ("", options.shard):
@@ -202,31 +203,15 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
                 "its own"
             )
     write_json(path, now)
-    given = sorted(name for name, camera in inputs.cameras.items() if camera.known)
-    known = {"images": inputs.digests, "failed": inputs.failed, KNOWN_CAMERAS: given}
-    listed = {"pairs": inputs.pairs.pairs, "left_out": inputs.pairs.unreadable}
-    write_json(options.output / "inputs.json", known | listed)
+    write_json(options.output / "inputs.json", known)
     return PairStore(folder=options.output / "pairs", fingerprint=mark)
 
 
-def difference(before: dict[str, Any], now: dict[str, Any]) -> str:
-    """Which options differ, for a message; the images or pairs when none does."""
-    there, here = _flags(before), _flags(now)
-    changed = [
-        f"{flag} ({there.get(flag)} there, {value} here)" for flag, value in here.items() if there.get(flag) != value
-    ]
-    return ", ".join(changed) or "images, pairs or cameras"
-
-
-def _flags(options: dict[str, Any], prefix: str = "--") -> dict[str, Any]:
-    """Nested options by the flags that set them, those left out that results do not follow from."""
-    flat: dict[str, Any] = {}
-    for name, value in options.items():
-        if prefix == "--" and name in NOT_IN_RESULTS | {"fingerprint"}:
-            continue
-        flag = "version of sgam-sfm" if name == VERSION else prefix + name.replace("_", "-")
-        flat |= _flags(value, "--" if name == "crop" else f"{flag}.") if isinstance(value, dict) else {flag: value}
-    return flat
+def _as_json(inputs: Inputs) -> dict[str, Any]:
+    """What OUT/inputs.json says."""
+    given = sorted(name for name, camera in inputs.cameras.items() if camera.known)
+    known = {"images": inputs.digests, "failed": inputs.failed, KNOWN_CAMERAS: given}
+    return known | {"pairs": inputs.pairs.pairs, "left_out": inputs.pairs.unreadable}
 
 
 def stamp_of_existing(options: MatchOptions) -> Stamp | None:

@@ -187,11 +187,13 @@ def test_folders_that_do_not_belong_together_are_refused(folder, whole, shards, 
 def test_images_that_changed_since_the_shards_are_noticed(folder, shards, tmp_path, capsys):
     images = tmp_path / "images"
     shutil.copytree(folder / "images", images)
-    with sorted(images.iterdir())[0].open("ab") as file:
+    changed = sorted(images.iterdir())[0]
+    with changed.open("ab") as file:
         file.write(b"\0")
     output = tmp_path / "out"
     assert cli.run(["join", *map(str, shards), "--output", str(output), "--images", str(images)]) == ERROR
-    assert "the shards were matched with other images, pairs or cameras; put back what they were" in error_of(capsys)
+    told = f"the shards were matched with other images (1 with another content, '{changed.name}' for one); put back"
+    assert told in error_of(capsys)
     assert not (output / "database.db").exists()
 
 
