@@ -8,6 +8,7 @@ from __future__ import annotations
 import sqlite3
 import zlib  # noqa: F401  (before pycolmap, whose wheel carries a zlib of its own: loaded later, ours would mix the two)
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
@@ -41,19 +42,11 @@ def _map(job: dict[str, Any], send: Progress) -> dict[str, Any]:
         calibrated = all(camera.has_prior_focal_length for camera in cameras)
         models = _map_globally(job, options, bool(fixed), calibrated, send)
 
-    verified = [count for count in counts if count > 0]
-    reason = (
-        f"COLMAP found no model of at least {options.min_model_size} images from {len(verified)} verified pairs, the "
-        f"best with {max(verified, default=0)} inliers; try pairs that overlap more (`sgam-sfm show OUT` draws them), "
-        "a larger --image-size, or another --matcher"
-    )
-    if len(verified) == 1:
-        reason = f"one verified pair is no model: COLMAP starts at {options.min_model_size} images; give more photos"
     if options.mapper != "triangulate":
         for model in models:
             refine(model, _incremental_options(options, fixed))
     elif not models[0].num_points3D():
-        models, reason = [], f"COLMAP triangulated no point with the known poses from {len(verified)} verified pairs"
+        models = []
     order = sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     summaries = []
     for number, model in enumerate(order):
@@ -61,7 +54,21 @@ def _map(job: dict[str, Any], send: Progress) -> dict[str, Any]:
         folder.mkdir(parents=True)
         model.write_binary(folder)
         summaries.append(asdict(_summary(model, folder.name, total)))
-    return {"models": summaries, "reason": "" if summaries else reason}
+    verified = [count for count in counts if count > 0]
+    return {"models": summaries, "reason": "" if summaries else _no_model(verified, total, options)}
+
+
+def _no_model(inliers: Sequence[int], total: int, options: MappingOptions) -> str:
+    """Why there may be no model, and what to do. Args: inliers: of each verified pair. total: number of images."""
+    if options.mapper == "triangulate":
+        return f"COLMAP triangulated no point with the known poses from {len(inliers)} verified pairs"
+    if total < options.min_model_size:
+        return f"COLMAP's models start at {options.min_model_size} images, and there are {total}; give more photos"
+    return (
+        f"COLMAP found no model of at least {options.min_model_size} images from {len(inliers)} verified pairs, the "
+        f"best with {max(inliers, default=0)} inliers; try pairs that overlap more (`sgam-sfm show OUT` draws them), "
+        "a larger --image-size, or another --matcher"
+    )
 
 
 def _map_incrementally(

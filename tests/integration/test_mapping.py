@@ -211,6 +211,8 @@ def test_no_model_is_a_result_with_a_reason(tmp_path):
         "pairs that overlap more (`sgam-sfm show OUT` draws them), a larger --image-size, or another --matcher"
     )
     assert list((tmp_path / "sparse").iterdir()) == []
+    summary = map_scene(scene, tmp_path / "sparse", min_model_size=7)
+    assert summary.reason == "COLMAP's models start at 7 images, and there are 6; give more photos"
 
 
 def test_abort_of_native_code_becomes_an_error_and_keeps_the_matches(tmp_path):
