@@ -142,6 +142,28 @@ def read_match_counts(path: Path) -> dict[Pair, int]:
         return {(names[id0], names[id1]): int(count) for (id0, id1), count in ids}
 
 
+def each_keypoints(path: Path) -> Iterator[tuple[str, Float[np.ndarray, "N _"]]]:
+    """The keypoints of every image, an image at a time; x and y come first.
+
+    Raises: InputError when the file is missing or no COLMAP database.
+    """
+    with opened(path) as database:
+        for image in database.read_all_images():
+            yield image.name, database.read_keypoints(image.image_id)
+
+
+def each_matches(path: Path) -> Iterator[tuple[Pair, Int[np.ndarray, "M 2"]]]:
+    """The matches of every pair as rows of keypoints, a pair at a time, the image with the smaller id first.
+
+    Raises: InputError when the file is missing or no COLMAP database.
+    """
+    with opened(path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        for pair_id in database.read_num_matches()[0]:
+            id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
+            yield (names[id0], names[id1]), database.read_matches(id0, id1)
+
+
 def read_pair_matches(path: Path, wanted: Iterable[Pair]) -> Iterator[tuple[Pair, MatchedPoints]]:
     """The matched keypoints of some pairs, verified or not, a pair at a time; pairs of unknown images are left out.
 

@@ -8,7 +8,7 @@ Pixels have COLMAP's corner origin, as everywhere in this project: nothing is sh
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -20,27 +20,30 @@ from sgam_sfm.pairs import Pair
 _NO_DESCRIPTOR = " 0" * 128  # COLMAP imports nothing without one; ours are not compared
 
 
-def write_keypoints_text(folder: Path, keypoints: Mapping[str, np.ndarray]) -> None:
-    """Write (N, 2) keypoints, with scale 1 and orientation 0, a file an image."""
-    for name, points in keypoints.items():
+def write_keypoints_text(folder: Path, keypoints: Iterable[tuple[str, np.ndarray]]) -> int:
+    """Write the (N, 2) keypoints of images, with scale 1 and orientation 0, a file each. Returns: how many files."""
+    count = 0
+    for name, points in keypoints:
         lines = [f"{len(points)} 128\n"]
         lines += [f"{x:.9g} {y:.9g} 1 0{_NO_DESCRIPTOR}\n" for x, y in np.asarray(points, np.float64)[:, :2]]
         with replacing(folder / f"{name}.txt") as partial:
             partial.write_text("".join(lines), encoding="utf-8")
+        count += 1
+    return count
 
 
-def write_matches_text(path: Path, matches: Mapping[Pair, np.ndarray]) -> None:
-    """Write (M, 2) rows of keypoints by pair, in the order of the mapping.
+def write_matches_text(path: Path, matches: Iterable[tuple[Pair, np.ndarray]]) -> int:
+    """Write (M, 2) rows of keypoints pair by pair, as they come. Returns: how many pairs.
 
     Raises: InputError for a name that COLMAP's format cannot hold.
     """
-    require_plain_names(name for pair in matches for name in pair)
-    blocks = (
-        f"{name0} {name1}\n" + "".join(f"{row0} {row1}\n" for row0, row1 in rows.tolist()) + "\n"
-        for (name0, name1), rows in matches.items()
-    )
-    with replacing(path) as partial:
-        partial.write_text("".join(blocks), encoding="utf-8")
+    count = 0
+    with replacing(path) as partial, partial.open("w", encoding="utf-8") as file:
+        for pair, rows in matches:
+            require_plain_names(pair)
+            file.write(" ".join(pair) + "\n" + "".join(f"{row0} {row1}\n" for row0, row1 in rows.tolist()) + "\n")
+            count += 1
+    return count
 
 
 def require_plain_names(names: Iterable[str]) -> None:

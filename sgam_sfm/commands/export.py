@@ -10,20 +10,19 @@ from sgam_sfm.stage_options import ExportOptions
 
 def run(options: ExportOptions, console: Console) -> int:
     """Write the files; print the commands that read them."""
-    from sgam_sfm.colmap_reading import read_database
+    from sgam_sfm.colmap_reading import each_keypoints, each_matches, read_camera_ids
     from sgam_sfm.colmap_text import require_plain_names, write_keypoints_text, write_matches_text
     from sgam_sfm.inputs import refuse_among_images
     from sgam_sfm.results import open_results
 
     results = open_results(options.results, options.images)
     refuse_among_images(options.output, results.images)
-    content = read_database(results.database())
-    matches = content["matches"]
-    require_plain_names(content["keypoints"])
-    write_keypoints_text(options.output / "keypoints", content["keypoints"])
-    write_matches_text(options.output / "matches.txt", matches)
+    database = results.database()
+    require_plain_names(read_camera_ids(database))
+    num_images = write_keypoints_text(options.output / "keypoints", each_keypoints(database))
+    num_pairs = write_matches_text(options.output / "matches.txt", each_matches(database))
     lines = (
-        ("written", f"{len(content['keypoints'])} keypoint files, {len(matches)} pairs in matches.txt"),
+        ("written", f"{num_images} keypoint files, {num_pairs} pairs in matches.txt"),
         (
             "next",
             f"colmap feature_importer --database_path new.db --image_path {results.images} "

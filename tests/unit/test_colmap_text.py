@@ -41,21 +41,22 @@ def raw_matches(path: Path) -> dict:
 
 
 def test_what_is_written(tmp_path):
-    write_keypoints_text(tmp_path / "keypoints", KEYPOINTS | {"none.jpg": np.zeros((0, 2), np.float32)})
+    content = KEYPOINTS | {"none.jpg": np.zeros((0, 2), np.float32)}
+    assert write_keypoints_text(tmp_path / "keypoints", content.items()) == len(content)
     for name, points in KEYPOINTS.items():
         found = features(tmp_path / f"keypoints/{name}.txt")
         np.testing.assert_array_equal(found[:, :2].astype(np.float32), points)
         np.testing.assert_array_equal(found[:, 2:], [[1, 0]] * len(points))
     assert len(features(tmp_path / "keypoints/none.jpg.txt")) == 0
     both = MATCHES | {("a.jpg", "c.jpg"): np.array([[0, 5], [1, 3]])}
-    write_matches_text(tmp_path / "matches.txt", both)
+    assert write_matches_text(tmp_path / "matches.txt", both.items()) == len(both)
     assert raw_matches(tmp_path / "matches.txt") == {pair: rows.tolist() for pair, rows in both.items()}
 
 
 @pytest.mark.parametrize("name", ["two words.jpg", "#1.jpg"])
 def test_names_that_the_format_cannot_hold(tmp_path, name):
     with pytest.raises(InputError) as error:
-        write_matches_text(tmp_path / "matches.txt", {("a.jpg", name): np.array([[0, 0]])})
+        write_matches_text(tmp_path / "matches.txt", [(("a.jpg", name), np.array([[0, 0]]))])
     assert str(error.value).startswith(f"image name '{name}' cannot be written to COLMAP's matches file")
     assert not (tmp_path / "matches.txt").exists()
 
