@@ -15,7 +15,7 @@ from sgam_core.collection import collect, coverage, merge
 from sgam_core.covisible import Frame
 from sgam_core.crops import area_crop
 from sgam_core.geometry import estimate_two_view, residuals
-from sgam_core.guidance import guided_areas
+from sgam_core.guidance import guided_areas, warp_between
 from sgam_core.looks import agree, best_look
 from sgam_core.options import CropOptions, SGAMOptions
 from sgam_core.point_matching import PairPoints
@@ -192,7 +192,9 @@ def _guided(first: _Found, points: PairPoints, estimate: Estimate, options: SGAM
     proposed = guided_areas(agreeing, frame0, frame1, left, options.guidance)
     if not proposed:
         return None
-    verdict = reject(points.guided(proposed), points.whole, True, estimate, options.geometry, options.rejection)
+    warps = [warp_between(agreeing, area, options.guidance) for area in proposed]
+    looked = points.guided(proposed, warps)
+    verdict = reject(looked, points.whole, True, estimate, options.geometry, options.rejection)
     if verdict.fallback:
         return None
     if verdict.model is None or (

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 
+import cv2
+import numpy as np
+from jaxtyping import Float
+
 from sgam_core.options import CropOptions
-from sgam_core.types import Box, Crop, Image
+from sgam_core.types import Box, Crop, Image, WarpedCrop
 
 
 def whole_crop(image: Image, options: CropOptions) -> Crop:
@@ -27,6 +31,31 @@ def box_crop(image: Image, box: Box, long_side: int, *, upsample: bool) -> Crop:
     x0, x1 = whole_pixels(box.x0, box.x1, image.width)
     y0, y1 = whole_pixels(box.y0, box.y1, image.height)
     return _crop(image, Box(x0=x0, y0=y0, x1=x1, y1=y1), long_side, upsample=upsample)
+
+
+def warped_alike(crop0: Crop, crop1: Crop, image1_from_image0: Float[np.ndarray, "2 3"]) -> tuple[Crop, Crop]:
+    """The same two crops, but that which shows things larger is warped so that they look as in the other one."""
+    if crop1.scale * abs(np.linalg.det(image1_from_image0[:, :2])) ** 0.5 >= crop0.scale:
+        return crop0, _warped(crop1, crop0, image1_from_image0)
+    return _warped(crop0, crop1, cv2.invertAffineTransform(image1_from_image0)), crop1
+
+
+def _warped(crop: Crop, other: Crop, affine: Float[np.ndarray, "2 3"]) -> Crop:
+    """The crop as the other one shows things. Args: affine: from the other image to this one."""
+    width, height = other.size
+    corners = np.array([(0.0, 0.0), (width, 0.0), (0.0, height), (width, height)])
+    corners = other.to_image(corners) @ affine[:, :2].T + affine[:, 2]
+    origin = corners[0]
+    axes = (corners[1:3] - origin) / np.array([[width], [height]])
+    (left, top), (right, bottom) = corners.min(axis=0), corners.max(axis=0)
+    x0, x1 = whole_pixels(left, right, crop.image.width)
+    y0, y1 = whole_pixels(top, bottom, crop.image.height)
+    return WarpedCrop(
+        image=crop.image,
+        window=Box(x0=x0, y0=y0, x1=x1, y1=y1),
+        size=other.size,
+        image_from_crop=tuple(np.column_stack([*axes, origin]).ravel().tolist()),
+    )
 
 
 def whole_pixels(start: float, stop: float, length: int) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -17,6 +18,7 @@ from sgam_core.covisible import Frame, enclosing_box
 from sgam_core.options import CropOptions, GuidanceOptions
 from sgam_core.types import Area, AreaMatch, Box, Matches
 
+_MOST_SLANTED = 4.0  # matches along a line fit any map across it
 _STRAY = 0.05  # a smaller share of a window's matches is no reason to look there
 
 
@@ -83,6 +85,28 @@ def guided_areas(
         )
         for window in finer
     )
+
+
+def warp_between(matches: Matches, area: AreaMatch, options: GuidanceOptions) -> Float[np.ndarray, "2 3"] | None:
+    """The affine map from image 0 to image 1 that the matches of an area follow; None where they follow none closely.
+
+    Seen through it, what is slanted in one image alone looks alike in both.
+    """
+    chosen = matches.select(area.area0.box.contains(matches.points0) & area.area1.box.contains(matches.points1))
+    if len(chosen) < options.min_matches or not options.max_bend:
+        return None
+    affine, _ = cv2.estimateAffine2D(chosen.points0, chosen.points1, method=cv2.LMEDS)
+    if affine is None or not _is_view(affine[:, :2]):
+        return None
+    off = np.linalg.norm(chosen.points0 @ affine[:, :2].T + affine[:, 2] - chosen.points1, axis=1)
+    longest = max(area.area1.box.width, area.area1.box.height)
+    return affine if np.median(off) <= options.max_bend * longest else None
+
+
+def _is_view(linear: Float[np.ndarray, "2 2"]) -> bool:
+    """Whether a linear map may be of what two images show: it mirrors nothing and slants nothing beyond recognition."""
+    widest, narrowest = np.linalg.svd(linear, compute_uv=False)
+    return bool(np.linalg.det(linear) > 0 and widest < _MOST_SLANTED * narrowest)
 
 
 def _within_budget(windows: Sequence[_Window], crop: CropOptions) -> float:

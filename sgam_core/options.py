@@ -266,6 +266,9 @@ class GuidanceOptions(_Checked):
     """Added on each side of a window, share of its long side (0: nothing)."""
     min_agreement: float = 0.7
     """Share of the first round's consistent matches that the second one's geometry must explain."""
+    max_bend: float = 0.04
+    """A window's crops are warped to look alike where its matches follow one affine map: the largest median distance
+    from it, share of the window's long side (0: no crop is warped)."""
     min_gain: float = 1.1
     """Crops are to be finer than the first round's matches by at least this factor."""
 

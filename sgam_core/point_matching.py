@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sgam_core.crops import box_crop, whole_crop
+from sgam_core.crops import box_crop, warped_alike, whole_crop
 from sgam_core.looks import Look
 from sgam_core.options import CropOptions
 from sgam_core.prediction import Estimate, MatchedArea
@@ -90,15 +90,19 @@ class PairPoints:
         confident = [next(areas) for _ in putative.confident]
         return confident, [[next(areas) for _ in group] for group in limited]
 
-    def guided(self, areas: Sequence[AreaMatch]) -> list[MatchedArea]:
-        """Point matches inside areas that say themselves how finely they are cropped."""
-        (image0, image1), turns = self.images, self.look.turns
-        crops = [
-            (_scaled_crop(image0, a.area0.box, a.scale0), _scaled_crop(image1, a.area1.box, a.scale1).turned(turns))
-            for a in areas
-        ]
+    def guided(self, areas: Sequence[AreaMatch], warps: Sequence[np.ndarray | None]) -> list[MatchedArea]:
+        """Point matches inside areas that say themselves how finely they are cropped.
+
+        Args: warps: the affine map (2, 3) from image 0 to image 1 that the crops of each area are to look alike by.
+        """
+        crops = [self._guided_crops(area, warp) for area, warp in zip(areas, warps, strict=True)]
         found = zip(areas, crops, self._match(crops), strict=True)
         return [self._matched(area, pair, matches) for area, pair, matches in found]
+
+    def _guided_crops(self, area: AreaMatch, warp: np.ndarray | None) -> tuple[Crop, Crop]:
+        crop0 = _scaled_crop(self.images[0], area.area0.box, area.scale0)
+        crop1 = _scaled_crop(self.images[1], area.area1.box, area.scale1)
+        return (crop0, crop1.turned(self.look.turns)) if warp is None else warped_alike(crop0, crop1, warp)
 
     def _within_budget(
         self, planned: Sequence[AreaMatch], crops: Sequence[tuple[Crop, Crop]], max_pixels: int

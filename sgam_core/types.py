@@ -169,6 +169,61 @@ class Crop:
         return array[int(w.y0) : int(w.y1), int(w.x0) : int(w.x1)]
 
 
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class WarpedCrop(Crop):
+    """A crop that is seen through any affine map, so that things look as they do in another image.
+
+    image_from_crop: (2, 3), row by row, from what `pixels` returns. Outside the window, which is resized to the same
+    size of things first, there is nothing: its pixels continue what is at the edge, and `mask` tells.
+    """
+
+    image_from_crop: tuple[float, float, float, float, float, float]
+
+    @property
+    def key(self) -> tuple:
+        return (*Crop.key.fget(self), *self.image_from_crop)  # type: ignore[attr-defined]
+
+    @property
+    def scale(self) -> float:
+        a, b, _, c, d, _ = self.image_from_crop
+        return abs(a * d - b * c) ** -0.5
+
+    @property
+    def crop_from_image(self) -> Float[np.ndarray, "2 3"]:
+        return cv2.invertAffineTransform(self._affine)
+
+    @property
+    def _affine(self) -> Float[np.ndarray, "2 3"]:
+        return np.reshape(self.image_from_crop, (2, 3))
+
+    def turned(self, turns: int) -> Crop:
+        raise NotImplementedError("what turns a crop is part of its warp")
+
+    def to_image(self, points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
+        image_points: np.ndarray = points @ self._affine[:, :2].T + self._affine[:, 2]
+        return image_points
+
+    def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
+        return self._warp(self._resized.pixels(), cv2.INTER_LINEAR, cv2.BORDER_REFLECT_101)
+
+    def mask(self) -> Bool[np.ndarray, "h w"]:
+        mask = self._resized.mask()
+        shown = np.ones(self._resized.size[::-1], np.uint8) if mask is None else mask.astype(np.uint8)
+        return self._warp(shown, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT).astype(bool)
+
+    @property
+    def _resized(self) -> Crop:
+        """The window, things as large in it as here on the whole."""
+        size = (max(round(self.window.width * self.scale), 1), max(round(self.window.height * self.scale), 1))
+        return Crop(image=self.image, window=self.window, size=size)
+
+    def _warp(self, array: np.ndarray, interpolation: int, border: int) -> np.ndarray:
+        whole = np.vstack([self._affine, [0, 0, 1]])
+        affine = self._resized.crop_from_image @ whole
+        affine[:, 2] += affine[:, :2] @ (0.5, 0.5) - 0.5  # OpenCV counts from the centre of the first pixel
+        return cv2.warpAffine(array, affine, self.size, flags=interpolation | cv2.WARP_INVERSE_MAP, borderMode=border)
+
+
 def _resize(array: np.ndarray, size: tuple[int, int], *, smooth: bool) -> np.ndarray:
     if size == (array.shape[1], array.shape[0]):
         return np.ascontiguousarray(array)

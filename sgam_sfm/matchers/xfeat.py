@@ -188,7 +188,7 @@ class XFeatStar:
         found = []
         for crop, own_map, own_reliability in zip(crops, maps.float(), reliability.float(), strict=True):
             best = own_reliability.flatten().argsort(descending=True, stable=True)
-            if crop.image.mask is not None:
+            if crop.mask() is not None:
                 best = best[torch.from_numpy(wanted(crop, centers.cpu().numpy())).to(self.device)[best]]
             best = best[:count]
             descriptors = own_map.flatten(1).T[best].contiguous()
