@@ -3,10 +3,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sgam_core.crops import area_crop, whole_crop
+from sgam_core.crops import area_crop, box_crop, warped_alike, whole_crop
 from sgam_core.errors import ShapeError
 from sgam_core.options import CropOptions
-from sgam_core.types import Box, Image
+from sgam_core.types import Box, Image, WarpedCrop
+from tests.textures import similarity, transfer, view
 
 
 def image(width: int, height: int, **more) -> Image:
@@ -107,3 +108,59 @@ def test_a_turned_crop_is_the_crop_turned_anticlockwise(width, height, long_side
     np.testing.assert_allclose(turned.to_image(seen), crop.to_image(moved), atol=1e-9)
     affine = turned.crop_from_image
     np.testing.assert_allclose(turned.to_image(seen) @ affine[:, :2].T + affine[:, 2], seen, atol=1e-9)
+
+
+def slanted(scale: float, degrees: float, slant: float) -> np.ndarray:
+    """An affine map (3, 3): across is seen so many times shorter, then all is turned and resized."""
+    return similarity(scale, degrees, (30, 20), (200, 150)) @ np.diag([1, 1 / slant, 1])
+
+
+SIZE = (400, 300)
+
+
+@pytest.mark.parametrize("affine", [slanted(1, 0, 2), slanted(0.7, 20, 1.5), slanted(1.4, -35, 1.2), slanted(1, 90, 1)])
+def test_crops_that_are_warped_look_alike(affine):
+    images = [Image(name=str(row), pixels=view(seen, SIZE)) for row, seen in enumerate((np.eye(3), affine))]
+    boxes = Box(x0=90, y0=60, x1=290, y1=240), Box(x0=70, y0=30, x1=330, y1=260)
+    crops = [box_crop(image, box, 220, upsample=False) for image, box in zip(images, boxes, strict=True)]
+    alike = warped_alike(*crops, affine[:2])
+    assert sum(isinstance(crop, WarpedCrop) for crop in alike) == 1
+    assert alike[0].size == alike[1].size
+    for crop, before in zip(alike, crops, strict=True):
+        assert crop.scale <= before.scale * (1 + 1e-9)  # no crop is enlarged
+        assert crop.key != before.key or crop is before
+
+    rows, columns = np.mgrid[: alike[0].size[1], : alike[0].size[0]]
+    centres = np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5
+    places = [crop.to_image(centres) for crop in alike]
+    np.testing.assert_allclose(transfer(affine, places[0]), places[1], atol=1e-6)
+    for crop, seen in zip(alike, places, strict=True):
+        inverse = crop.crop_from_image
+        np.testing.assert_allclose(seen @ inverse[:, :2].T + inverse[:, 2], centres, atol=1e-9)
+
+    shown = np.ones(alike[0].size[::-1], bool)
+    for crop in alike:
+        shown &= True if crop.mask() is None else crop.mask()
+    assert shown.mean() > 0.4
+    difference = np.abs(alike[0].pixels().astype(float) - alike[1].pixels())[shown]
+    apart = np.abs(crops[0].pixels().astype(float) - np.roll(crops[0].pixels(), 4, axis=1))
+    assert difference.mean() < 0.4 * apart.mean()
+
+
+def test_where_a_warped_crop_shows_nothing_its_mask_says_so():
+    plain = image(200, 100)
+    known = image(200, 100, mask=np.arange(200) < np.full((100, 1), 150))
+    for photo, end in ((plain, 200), (known, 150)):
+        crop0 = whole_crop(image(200, 100), CropOptions(image_size=200))
+        crop1 = whole_crop(photo, CropOptions(image_size=200))
+        _, warped = warped_alike(crop0, crop1, np.array([[1.0, 0, 60], [0, 1, 10]]))
+        expected = np.zeros((100, 200), bool)
+        expected[:90, : end - 60] = True
+        np.testing.assert_array_equal(warped.mask(), expected)
+        np.testing.assert_array_equal(warped.pixels()[expected], crop1.pixels()[10:, 60:end].reshape(-1, 3))
+
+
+def test_a_warped_crop_is_not_turned():
+    crop = whole_crop(image(40, 30), CropOptions(image_size=40))
+    with pytest.raises(NotImplementedError):
+        warped_alike(crop, crop, np.eye(3)[:2])[1].turned(1)

@@ -13,9 +13,9 @@ from sgam_core import SemanticAreaMatcher, SGAMOptions, a2pm
 from sgam_core.a2pm import match_described, match_whole
 from sgam_core.covisible import Frame
 from sgam_core.geometry import estimate_two_view
-from sgam_core.guidance import guided_areas
+from sgam_core.guidance import guided_areas, warp_between
 from sgam_core.options import CropOptions, GuidanceOptions, changed
-from sgam_core.types import AreaState, Matches
+from sgam_core.types import Area, AreaMatch, AreaState, Box, Matches
 from tests.room import Room, TrueMatcher
 
 FRAME = Frame(name="a", width=3000, height=2000, camera_matrix=None)
@@ -79,6 +79,49 @@ def test_more_pixels_are_spent_up_to_the_resolution_of_the_images():
 @pytest.mark.parametrize("matches", [zoomed(1, count=19), zoomed(1, sigma=1.0), Matches.empty()])
 def test_no_window_with_few_matches_or_without_a_gain_in_resolution(matches):
     assert guided_areas(matches, FRAME, FRAME, CROP, GuidanceOptions()) == ()
+
+
+WHOLE = Area(kind="guided", box=Box(x0=0, y0=0, x1=FRAME.width, y1=FRAME.height))
+BOTH = AreaMatch(area0=WHOLE, area1=WHOLE, distance=0.0)
+AFFINE = np.array([[0.8, -0.3, 500], [0.2, 0.5, 300]])
+
+
+def mapped(points1, *, wrong: int = 0) -> Matches:
+    """Matches (200) of points all over the image with what a function maps them to, some of them wrong."""
+    rng = np.random.default_rng(0)
+    points0 = rng.uniform((300, 300), (2700, 1700), (200, 2))
+    found = points1(points0) + rng.normal(0, 1, (200, 2))
+    found[:wrong] = rng.uniform((300, 300), (2700, 1700), (wrong, 2))
+    return Matches(points0=points0, points1=found, scores=np.ones(200))
+
+
+def test_the_map_that_most_matches_follow_is_found():
+    warp = warp_between(mapped(lambda x: x @ AFFINE[:, :2].T + AFFINE[:, 2], wrong=60), BOTH, GuidanceOptions())
+    assert warp is not None
+    corners = np.array([(0, 0), (FRAME.width, FRAME.height)])
+    expected = corners @ AFFINE[:, :2].T + AFFINE[:, 2]
+    np.testing.assert_allclose(corners @ warp[:, :2].T + warp[:, 2], expected, atol=5)
+
+
+@pytest.mark.parametrize(
+    ("matches", "options"),
+    [
+        (mapped(lambda x: x + 500 * np.sin(x / 300)), GuidanceOptions()),  # no affine map
+        (mapped(lambda x: x * (-1, 1) + (FRAME.width, 0)), GuidanceOptions()),  # a mirror image
+        (mapped(lambda x: x * (0.2, 1) + (900, 0)), GuidanceOptions()),  # seen from the side
+        (mapped(lambda x: x), GuidanceOptions(min_matches=201)),
+        (mapped(lambda x: x), GuidanceOptions(max_bend=0)),
+    ],
+)
+def test_no_map_where_matches_follow_none_or_one_that_no_two_views_have(matches, options):
+    assert warp_between(matches, BOTH, options) is None
+
+
+def test_matches_along_a_line_tell_no_map():
+    points = np.column_stack([np.linspace(300, 2700, 100), np.linspace(400, 900, 100)])
+    points = points + np.random.default_rng(0).normal(0, 0.3, points.shape)
+    other = points + np.random.default_rng(1).normal(0, 3, points.shape)
+    assert warp_between(Matches(points0=points, points1=other, scores=np.ones(100)), BOTH, GuidanceOptions()) is None
 
 
 def in_room(room: Room, options: SGAMOptions, names=("view03.jpg", "view04.jpg")):
