@@ -110,7 +110,7 @@ class Crop:
     turns: int = 0
 
     @property
-    def key(self) -> tuple[str, float, float, float, float, int, int, int]:
+    def key(self) -> tuple[str | float, ...]:
         """Equal for crops with equal content: what a matcher may cache features by, within one collection."""
         w = self.window
         return (self.image.name, w.x0, w.y0, w.x1, w.y1, *self.size, self.turns)
@@ -180,8 +180,9 @@ class WarpedCrop(Crop):
     image_from_crop: tuple[float, float, float, float, float, float]
 
     @property
-    def key(self) -> tuple:
-        return (*Crop.key.fget(self), *self.image_from_crop)  # type: ignore[attr-defined]
+    def key(self) -> tuple[str | float, ...]:
+        w = self.window
+        return (self.image.name, w.x0, w.y0, w.x1, w.y1, *self.size, *self.image_from_crop)
 
     @property
     def scale(self) -> float:
