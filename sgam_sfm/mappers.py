@@ -21,6 +21,8 @@ from sgam_sfm.mapping import MappingOptions, ModelSummary
 from sgam_sfm.refinement import refine
 from sgam_sfm.triangulation import triangulated
 
+_MANY_INLIERS = 100  # COLMAP starts a model with a pair that has as many
+
 
 def _map(job: dict[str, Any], send: Progress) -> dict[str, Any]:
     """Runs in the child process; see `colmap_process`."""
@@ -64,6 +66,13 @@ def _no_model(inliers: Sequence[int], total: int, options: MappingOptions) -> st
         return f"COLMAP triangulated no point with the known poses from {len(inliers)} verified pairs"
     if total < options.min_model_size:
         return f"COLMAP's models start at {options.min_model_size} images, and there are {total}; give more photos"
+    strong = sum(count >= _MANY_INLIERS for count in inliers)
+    if 2 * strong > len(inliers):
+        return (
+            f"COLMAP found no model of at least {options.min_model_size} images, though {strong} of {len(inliers)} "
+            f"verified pairs have {_MANY_INLIERS} inliers or more: photos from nearly one place show no depth, so give "
+            "some from farther apart; where EXIF has no focal length, give --camera-params or --cameras"
+        )
     return (
         f"COLMAP found no model of at least {options.min_model_size} images from {len(inliers)} verified pairs, the "
         f"best with {max(inliers, default=0)} inliers; try pairs that overlap more (`sgam-sfm show OUT` draws them), "

@@ -36,13 +36,15 @@ class Scene:
     centers: dict[str, np.ndarray]
 
 
-def make_scene(tmp_path: Path, noise_px: float = 0.0, camera: CameraOptions | None = CAMERA) -> Scene:
+def make_scene(
+    tmp_path: Path, noise_px: float = 0.0, camera: CameraOptions | None = CAMERA, arc_deg: float = 25.0
+) -> Scene:
     rng = np.random.default_rng(0)
     points = rng.uniform((-2, -1.5, 5), (2, 1.5, 8), (300, 3))
     folder = tmp_path / "images"
     folder.mkdir()
     rotations, centers, keypoints, order = {}, {}, {}, {}
-    for name, angle in zip(NAMES, np.radians(np.linspace(-25, 25, len(NAMES))), strict=True):
+    for name, angle in zip(NAMES, np.radians(np.linspace(-arc_deg, arc_deg, len(NAMES))), strict=True):
         PIL.Image.new("RGB", (WIDTH, HEIGHT)).save(folder / name)
         c, s = np.cos(angle), np.sin(angle)
         rotations[name] = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])  # camera from world, about the point (0, 0, 6.5)
@@ -213,6 +215,14 @@ def test_no_model_is_a_result_with_a_reason(tmp_path):
     assert list((tmp_path / "sparse").iterdir()) == []
     summary = map_scene(scene, tmp_path / "sparse", min_model_size=7)
     assert summary.reason == "COLMAP's models start at 7 images, and there are 6; give more photos"
+
+
+def test_photos_from_one_place_are_told_from_photos_that_do_not_overlap(tmp_path):
+    scene = make_scene(tmp_path, noise_px=0.5, arc_deg=0.1)
+    verify(scene.database)
+    summary = map_scene(scene, tmp_path / "sparse")
+    assert summary.models == ()
+    assert "no model of at least 3 images, though 15 of 15 verified pairs have 100 inliers or more: " in summary.reason
 
 
 def test_abort_of_native_code_becomes_an_error_and_keeps_the_matches(tmp_path):
