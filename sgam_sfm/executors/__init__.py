@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from sgam_core import PointMatcher
 from sgam_sfm.inputs import Inputs
@@ -31,6 +31,7 @@ class MatchingJob:
     labels: LabelMaps | None
 
 
+@runtime_checkable
 class Executor(Protocol):
     """Matches blocks of pairs.
 
