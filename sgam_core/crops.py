@@ -34,7 +34,11 @@ def box_crop(image: Image, box: Box, long_side: int, *, upsample: bool) -> Crop:
 
 
 def warped_alike(crop0: Crop, crop1: Crop, image1_from_image0: Float[np.ndarray, "2 3"]) -> tuple[Crop, Crop]:
-    """The same two crops, but that which shows things larger is warped so that they look as in the other one."""
+    """Two crops, of which the one that shows things larger is warped so that they look as in the other one.
+
+    Args: image1_from_image0: (2, 3), the affine map between the two images that things follow here.
+    Returns: both of one size, that of the crop that stays. The other one is cut anew, where the first one lies in it.
+    """
     if crop1.scale * abs(np.linalg.det(image1_from_image0[:, :2])) ** 0.5 >= crop0.scale:
         return crop0, _warped(crop1, crop0, image1_from_image0)
     return _warped(crop0, crop1, cv2.invertAffineTransform(image1_from_image0)), crop1
