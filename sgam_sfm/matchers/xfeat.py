@@ -185,12 +185,10 @@ class XFeatStar:
         cells_y, cells_x = torch.meshgrid(*(torch.arange(n, device=self.device) for n in maps.shape[2:]), indexing="ij")
         step = torch.tensor([size[0] / width, size[1] / height], dtype=torch.float64, device=self.device)
         centers = (CELL * torch.stack([cells_x, cells_y], -1).reshape(-1, 2) + CELL / 2) * step
-        found = []
+        found, places = [], centers.cpu().numpy()
         for crop, own_map, own_reliability in zip(crops, maps.float(), reliability.float(), strict=True):
             best = own_reliability.flatten().argsort(descending=True, stable=True)
-            if crop.mask() is not None:
-                best = best[torch.from_numpy(wanted(crop, centers.cpu().numpy())).to(self.device)[best]]
-            best = best[:count]
+            best = best[torch.from_numpy(wanted(crop, places)).to(self.device)[best]][:count]
             descriptors = own_map.flatten(1).T[best].contiguous()
             found.append((descriptors, centers[best], step.expand(len(best), 2)))
         return found
