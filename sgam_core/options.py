@@ -254,6 +254,8 @@ class GuidanceOptions(_Checked):
     max_chance: float = 0.01
     """Where they do not agree, area pairs are matched that whole-image matches join more often than chance: the largest
     probability of chance (1: all area pairs)."""
+    min_overlap: float = 0.5
+    """And of whose areas' matches, in either image, so large a share lies in both areas (0: any)."""
     evidence_size: int = 512
     """Long side of these areas' crops at the matcher, pixels, where area_size is larger."""
     evidence_pixels: int = 1_500_000

@@ -28,7 +28,7 @@ def matches(joined: int, wrong: int, seed: int = 0) -> Matches:
 
 def test_areas_that_matches_join_stay_and_others_are_skipped_with_the_reason():
     true, wrong = area_match(LEFT, LEFT), area_match(LEFT, RIGHT)
-    judged = supported(PutativeAreas(confident=(true, wrong), doubtful=((wrong, true),)), matches(60, 100), 0.01)
+    judged = supported(PutativeAreas(confident=(true, wrong), doubtful=((wrong, true),)), matches(60, 100), 0.01, 0.0)
     assert judged.confident[0] == judged.doubtful[0][1] == true
     skipped = judged.confident[1]
     assert skipped.state == judged.doubtful[0][0].state == AreaState.SKIPPED
@@ -37,11 +37,26 @@ def test_areas_that_matches_join_stay_and_others_are_skipped_with_the_reason():
 
 @given(st.integers(0, 400), st.integers(0, 1000))
 def test_chance_is_rarely_taken_for_support(wrong, seed):
-    judged = supported(PutativeAreas(confident=(area_match(LEFT, LEFT),)), matches(0, wrong, seed), 1e-9)
+    judged = supported(PutativeAreas(confident=(area_match(LEFT, LEFT),)), matches(0, wrong, seed), 1e-9, 0.0)
     assert judged.confident[0].state is AreaState.SKIPPED
 
 
 @pytest.mark.parametrize("found", [Matches.empty(), matches(0, 1)])
 def test_next_to_no_match_supports_nothing(found):
-    judged = supported(PutativeAreas(confident=(area_match(LEFT, LEFT),)), found, 0.01)
+    judged = supported(PutativeAreas(confident=(area_match(LEFT, LEFT),)), found, 0.01, 0.0)
     assert judged.confident[0].state is AreaState.SKIPPED
+
+
+@pytest.mark.parametrize(("height", "stays"), [(100, True), (70, True), (30, False)])
+@pytest.mark.parametrize("first", [True, False])
+def test_areas_that_overlap_in_a_small_part_are_skipped_whichever_is_the_larger(height, stays, first):
+    part = Box(x0=0, y0=0, x1=50, y1=height)
+    pair = area_match(LEFT, part) if first else area_match(part, LEFT)
+    points = np.random.default_rng(0).uniform(0, 100, (400, 2))
+    still = Matches(points0=points, points1=points, scores=np.ones(400))
+    judged = supported(PutativeAreas(confident=(pair,)), still, 0.01, 0.5).confident[0]
+    if stays:
+        assert judged == pair
+    else:
+        assert judged.state is AreaState.SKIPPED
+        assert judged.reason.endswith("they overlap in part")
