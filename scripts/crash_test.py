@@ -5,7 +5,7 @@
 The collection is the rendered room, small. A kill is SIGKILL to every process of the run (as a power cut or a job
 scheduler does it), to the supervisor alone (its children have to end by themselves), or to the process that matches
 (which has to be started again by itself, at most once for each output folder, since a pair that ends the process twice
-is given up). After one kill in four the file that was written last is cut short too. A run that comes to its end is
+is given up); a stop is SIGTERM to the supervisor. After one kill in four the file that was written last is cut short too. A run that comes to its end is
 compared, and another one is begun in a new folder. Prints JSON; the exit code is 1 when any database differs.
 """
 
@@ -28,13 +28,13 @@ from typing import Any
 import psutil
 
 from sgam_sfm.colmap_reading import database_content
-from sgam_sfm.exit_codes import DONE, SOME_FAILED
+from sgam_sfm.exit_codes import DONE, INTERRUPTED, SOME_FAILED
 from sgam_sfm.scene import demo_views, write_scene
 
 OPTIONS = ("--matcher", "sift", "--image-size", "240", "--area-size", "160", "--block-images", "2", "--no-mapping")
 CUT_SHARE, EARLY_SHARE = 0.25, 0.1
 NOT_CUT = (".lock", "progress.json", "log.txt", "colmap.log")  # written all the time, and read by nobody on resuming
-KINDS = ("all", "all", "supervisor", "worker")
+KINDS = ("all", "all", "supervisor", "worker", "stop")
 
 
 @dataclass
@@ -99,7 +99,7 @@ def torture(command: list[str], folder: Path, kills: int, rng: random.Random) ->
                 outcome.cut[_cut_last(output, rng)] += 1
         code = run.wait()
         log.close()
-        if code < 0:
+        if code < 0 or code == INTERRUPTED:
             continue
         # What the last kill cut short may be a pair of an image: nothing may have failed.
         same = code == DONE and database_content(output / "database.db") == expected
@@ -123,6 +123,8 @@ def _kill(run: subprocess.Popen, kind: str) -> int:
     try:
         if kind == "all":
             os.killpg(run.pid, signal.SIGKILL)
+        elif kind == "stop":
+            os.kill(run.pid, signal.SIGTERM)
         elif kind == "supervisor":
             children = psutil.Process(run.pid).children(recursive=True)
             os.kill(run.pid, signal.SIGKILL)

@@ -22,7 +22,7 @@ from sgam_sfm.results import json_object, open_results
 from sgam_sfm.run_record import recording
 from sgam_sfm.runner import KNOWN_CAMERAS
 from sgam_sfm.stage_options import AggregateOptions, ReconstructOptions
-from sgam_sfm.store import read_pairs_of
+from sgam_sfm.store import read_pairs_of, stored_files
 from sgam_sfm.summary import summarise_keypoints, versions
 from sgam_sfm.verification import VerificationOptions
 
@@ -123,7 +123,7 @@ def source_of(options: ReconstructOptions | AggregateOptions) -> Source:
     refuse_among_images(source.output, source.images)
     there = json_object(source.output / "options.json").get("fingerprint")
     ours = json_object(source.results / "options.json").get("fingerprint") if source.results else None
-    another_run = there is not None and (there != ours or any((source.output / "pairs").glob("*.h5")))
+    another_run = there is not None and (there != ours or bool(stored_files(source.output)))
     if another_run and not source.in_place:
         raise OptionError(f"'{source.output}' holds another run; choose a new --output folder")
     return source

@@ -29,7 +29,7 @@ from sgam_sfm.progress import Stages
 from sgam_sfm.results import json_object
 from sgam_sfm.run_record import recording
 from sgam_sfm.shards import Shard
-from sgam_sfm.store import PairStore
+from sgam_sfm.store import PairStore, stored_files
 from sgam_sfm.summary import CountedPairs, summarise_images, summarise_keypoints, summarise_pairs, versions
 from sgam_sfm.verification import VerificationOptions, VerificationSummary
 
@@ -192,7 +192,7 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
         if not before:
             _log.warning("'%s' is damaged, and is written anew", path)
         if before.get("fingerprint") != mark:
-            if before and any((options.output / "pairs").glob("*.h5")):
+            if before and stored_files(options.output):
                 other = difference((before, json_object(options.output / "inputs.json")), (now, known))
                 raise OptionError(f"'{options.output}' was begun with other {other}; choose a new --output folder")
             (options.output / "labels" / RECORD).unlink(missing_ok=True)  # they follow from the options too

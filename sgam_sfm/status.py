@@ -12,7 +12,7 @@ from typing import Any
 from sgam_core.errors import InputError
 from sgam_sfm.nearest import did_you_mean_run
 from sgam_sfm.run_record import RunRecord, read_run_record
-from sgam_sfm.store import read_outcomes
+from sgam_sfm.store import read_outcomes, stored_files
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -59,7 +59,7 @@ def read_status(output: Path) -> RunStatus:
         failed[" - ".join(pair)] = next(reasons, "one of its images cannot be used")
     done = 0
     damaged = []
-    for path in sorted((output / "pairs").glob("*.h5")):
+    for path in stored_files(output):
         try:
             outcomes = read_outcomes(path)
         except InputError:

@@ -1,15 +1,16 @@
-"""Raw pair results on disk, one HDF5 file per block of pairs: the unit of work and of resume.
+"""Raw pair results on disk, one HDF5 file per block of pairs: the unit of work.
 
-A block's file appears under its name only when it is whole, so that a block either counts as done or is done again. It
-begins with a digest of what follows, so that a block that the disk has damaged is found, and done again too. The
-matches of its pairs follow each other in one array per field: HDF5 needs about as long for an array of one pair as for
-one of thousands of matches.
+A block's file appears under its name only when it is whole; until then, its first pairs are kept in one of the same
+kind from time to time. A file begins with a digest of what follows, so that one that the disk has damaged is found, and
+its pairs are matched again. The matches of its pairs follow each other in one array per field: HDF5 needs about as long
+for an array of one pair as for one of thousands of matches.
 
     pairs/00000.h5          user block: SHA-256 of the rest; attributes: fingerprint
       facts                 JSON: for every pair its names, error, fallback, areas, two-view geometry, ...
       ends                  (P,) the row after the last match of every pair
       points0, points1      (M, 2) float32 pixels, corner origin
       scores, sigmas0, sigmas1, area_index  (M,)
+    pairs/00001.begun       the same of a block that is in work
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ _FACTS = (
     *("notes", "pixels_matched", "turns", "zoom"),
 )
 _AREAS = TypeAdapter(tuple[AreaMatch, ...])
+_BEGUN = ".begun"
 _DIGEST_BLOCK = 512  # bytes before the HDF5 file proper: the smallest user block there is
 _MAX_MATCHES = 10**8  # of a block: a file made by hand can claim any number in a few bytes
 # What h5py, json and pydantic are known to raise on files that are damaged or made by hand.
@@ -74,23 +76,60 @@ class PairStore:
         Args: pairs: what it has to hold, in this order; any when empty.
         Raises: InputError when it was made under another one.
         """
-        path = self.path(block)
+        names = self._pairs_in(self.path(block))
+        return names is not None and (not pairs or names == list(pairs))
+
+    def write(self, block: int, records: Sequence[PairRecord]) -> None:
+        """Keep a whole block."""
+        self._write(self.path(block), records)
+        self._path_of_begun(block).unlink(missing_ok=True)
+
+    def begun(self, block: int, pairs: Sequence[Pair]) -> list[PairRecord]:
+        """The records of a block's first pairs, as far as they were matched and kept before it was whole.
+
+        Args: pairs: all of the block.
+        Raises: InputError when they were made under another fingerprint.
+        """
+        path = self._path_of_begun(block)
+        names = self._pairs_in(path) or []
+        return list(_read_file(path)) if names and names == list(pairs[: len(names)]) else []
+
+    def write_begun(self, block: int, records: Sequence[PairRecord]) -> None:
+        """Keep the first pairs of a block that is in work."""
+        self._write(self._path_of_begun(block), records)
+
+    def read(self, block: int) -> Iterator[PairRecord]:
+        """The records of a block, in its order.
+
+        Raises: InputError for a file that is damaged, or none of a store.
+        """
+        return _read_file(self.path(block))
+
+    def read_all(self, blocks: int) -> Iterator[PairRecord]:
+        """The records of blocks 0, 1, ... in order, one block in memory at a time."""
+        for block in range(blocks):
+            yield from self.read(block)
+
+    def _path_of_begun(self, block: int) -> Path:
+        return self.path(block).with_suffix(_BEGUN)
+
+    def _pairs_in(self, path: Path) -> list[Pair] | None:
+        """The pairs of a file; None where there is none, or it is damaged."""
         if not path.exists():
-            return False
+            return None
         try:
             _check_digest(path)
             with h5py.File(path, "r") as file:
                 mark = str(file.attrs["fingerprint"])
-                names = [_pair_of(told) for told in _read_facts(file)] if pairs else []
+                names = [_pair_of(told) for told in _read_facts(file)]
         except _UNREADABLE as error:
             _log.warning("'%s' is damaged (%s): its pairs are matched again, all others are kept", path, _line(error))
-            return False
+            return None
         if mark != self.fingerprint:
             raise InputError(f"'{path}' was made from other images, pairs or options; choose a new --output folder")
-        return names == [tuple(pair) for pair in pairs]
+        return names
 
-    def write(self, block: int, records: Sequence[PairRecord]) -> None:
-        """Keep a whole block."""
+    def _write(self, path: Path, records: Sequence[PairRecord]) -> None:
         content = io.BytesIO()  # HDF5 ends the process when it closes a file that the disk has no room for
         with h5py.File(content, "w", track_order=True, userblock_size=_DIGEST_BLOCK) as file:
             file.attrs["fingerprint"] = self.fingerprint
@@ -98,24 +137,15 @@ class PairStore:
         view = content.getbuffer()
         digest = hashlib.sha256(view[_DIGEST_BLOCK:]).hexdigest().encode()
         view[: len(digest)] = digest
-        with replacing(self.path(block)) as partial:
+        with replacing(path) as partial:
             partial.write_bytes(view)
 
-    def read(self, block: int) -> Iterator[PairRecord]:
-        """The records of a block, in its order.
 
-        Raises: InputError for a file that is damaged, or none of a store.
-        """
-        path = self.path(block)
-        with _readable(path):
-            _check_digest(path)  # first: on damaged files HDF5's own code can fail in ways that end the process
-        with _readable(path), h5py.File(path, "r") as file:
-            yield from _read_records(file)
-
-    def read_all(self, blocks: int) -> Iterator[PairRecord]:
-        """The records of blocks 0, 1, ... in order, one block in memory at a time."""
-        for block in range(blocks):
-            yield from self.read(block)
+def _read_file(path: Path) -> Iterator[PairRecord]:
+    with _readable(path):
+        _check_digest(path)  # first: on damaged files HDF5's own code can fail in ways that end the process
+    with _readable(path), h5py.File(path, "r") as file:
+        yield from _read_records(file)
 
 
 def _write_records(file: h5py.File, records: Sequence[PairRecord]) -> None:
@@ -189,6 +219,11 @@ def _array(data: h5py.Dataset) -> np.ndarray:
         raise ValueError(f"{data.name} has shape {data.shape} of {data.dtype}")
     array: np.ndarray = data[()]
     return array
+
+
+def stored_files(output: Path) -> list[Path]:
+    """The blocks of a run's output folder that are done, then those in work."""
+    return [path for suffix in (".h5", _BEGUN) for path in sorted((output / "pairs").glob(f"*{suffix}"))]
 
 
 def read_pairs_of(output: Path) -> Iterator[PairRecord]:

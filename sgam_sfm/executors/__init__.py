@@ -16,7 +16,6 @@ from sgam_sfm.inputs import Inputs
 from sgam_sfm.label_maps import LabelMaps
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
-from sgam_sfm.progress import Advance
 from sgam_sfm.store import PairRecord
 
 Begin = Callable[[Pair], None]
@@ -45,11 +44,13 @@ class Executor(Protocol):
     def own_device(self) -> str: ...
 
     def run(
-        self, job: MatchingJob, blocks: Sequence[tuple[int, Sequence[Pair]]], advance: Advance, begin: Begin
+        self, job: MatchingJob, blocks: Sequence[tuple[int, Sequence[Pair]]], begin: Begin
     ) -> Iterator[tuple[int, Sequence[PairRecord]]]:
-        """Match the numbered blocks: the number and records of each, once, as soon as it is done, in any order.
+        """Match the numbered blocks: the number of a block and the records of its next pairs, as soon as they are done.
 
-        Args: advance is told how many more pairs are done; begin, where a crash would end this process, which is next.
+        Blocks come in any order, the pairs of each in their own, every pair once.
+
+        Args: begin is told, where a crash would end this process, which pair is next.
         Raises: OptionError when the options ignore or mask a label that is none.
         """
         ...

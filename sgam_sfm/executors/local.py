@@ -12,7 +12,6 @@ from sgam_sfm.machine import find_device, use_threads
 from sgam_sfm.matching import CollectionMatcher, create_matcher, failed_record
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
-from sgam_sfm.progress import Advance
 from sgam_sfm.store import PairRecord
 from sgam_sfm.supervised import given_up
 
@@ -37,18 +36,15 @@ class LocalExecutor:
         return LocalExecutor(device=device, point_matcher=point_matcher)
 
     def run(
-        self, job: MatchingJob, blocks: Sequence[tuple[int, Sequence[Pair]]], advance: Advance, begin: Begin
+        self, job: MatchingJob, blocks: Sequence[tuple[int, Sequence[Pair]]], begin: Begin
     ) -> Iterator[tuple[int, Sequence[PairRecord]]]:
         matcher = CollectionMatcher(job.options, job.inputs, job.labels, self.point_matcher)
         for number, block in blocks:
-            records = []
             with matcher.block(block):
                 for pair in block:
                     begin(pair)
                     reason = given_up(pair)
-                    records.append(failed_record(pair, reason) if reason else matcher.match(pair))
-                    advance(1)
-            yield number, records
+                    yield number, [failed_record(pair, reason) if reason else matcher.match(pair)]
 
     def facts(self) -> dict[str, Any]:
         return {"name": "local"}

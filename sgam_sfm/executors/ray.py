@@ -27,7 +27,6 @@ from sgam_sfm.machine import find_device, use_threads
 from sgam_sfm.matching import CollectionMatcher, create_matcher, special_labels
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair, PairList
-from sgam_sfm.progress import Advance
 from sgam_sfm.store import PairRecord
 from sgam_sfm.summary import versions
 
@@ -169,7 +168,7 @@ class RayExecutor:
     copies: Counter[int] = field(default_factory=Counter)
 
     def run(
-        self, job: MatchingJob, blocks: Sequence[tuple[int, Sequence[Pair]]], advance: Advance, begin: Begin
+        self, job: MatchingJob, blocks: Sequence[tuple[int, Sequence[Pair]]], begin: Begin
     ) -> Iterator[tuple[int, Sequence[PairRecord]]]:
         special_labels(job.options, job.labels)
         if not blocks:
@@ -182,7 +181,6 @@ class RayExecutor:
                 if record.error:
                     _log.warning("%s - %s: %s", *record.pair, record.error)
             yield number, done.records
-            advance(len(content[number]))
 
     def facts(self) -> dict[str, Any]:
         return {"name": "ray", "blocks_of_machines": dict(self.blocks_of), "copied_blocks": sorted(self.copies)}

@@ -17,10 +17,11 @@ import pytest
 from sgam_sfm import cli
 from sgam_sfm.colmap_reading import database_content
 from sgam_sfm.database import is_whole
-from sgam_sfm.exit_codes import DONE, ERROR, SOME_FAILED
+from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED, SOME_FAILED
 from sgam_sfm.matching import CollectionMatcher
 from sgam_sfm.progress import Stages
 from sgam_sfm.run_record import recording
+from sgam_sfm.store import stored_files
 from tests.room import Room, write_room
 
 # Found by every Python process that is started with its folder on the path.
@@ -124,6 +125,29 @@ def test_a_pair_that_ends_the_process_is_tried_twice_then_recorded(folder, undis
     status = capsys.readouterr().out
     assert "crashes    ended from outside and started again 2 times (see log.txt)" in status
     assert f"           {names[0]} - {names[1]}: {reason}" in status
+
+
+def test_a_run_that_is_stopped_in_the_middle_of_a_block_goes_on_there(folder, tmp_path, monkeypatch, capsys):
+    whole, output = tmp_path / "whole", tmp_path / "out"
+    assert cli.run([*arguments(folder, whole), "--block-images", "4"]) == DONE
+    plain, matched = CollectionMatcher.match, []
+
+    def match(self, pair):
+        if len(matched) == 4:
+            matched.append("stopped")
+            raise KeyboardInterrupt
+        matched.append(pair)
+        return plain(self, pair)
+
+    monkeypatch.setattr(CollectionMatcher, "match", match)
+    assert cli.run([*arguments(folder, output), "--block-images", "4"]) == INTERRUPTED
+    assert cli.run(["status", str(output)]) == DONE
+    assert "pairs      4 of 6 matched and stored" in capsys.readouterr().out
+    assert cli.run([*arguments(folder, output), "--block-images", "4"]) == DONE
+    assert len(matched) == 7
+    assert len(set(matched)) == 7
+    assert [path.read_bytes() for path in stored_files(output)] == [path.read_bytes() for path in stored_files(whole)]
+    assert database_content(output / "database.db") == database_content(whole / "database.db")
 
 
 def test_memory_that_does_not_suffice_once_and_always(folder, tmp_path, monkeypatch):

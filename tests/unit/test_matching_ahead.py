@@ -57,7 +57,7 @@ def matched(options: MatchOptions, inputs: Inputs) -> dict[tuple[str, str], tupl
     executor = LocalExecutor(device="cpu", point_matcher=MeanMatcher())
     job = MatchingJob(options=options, inputs=inputs, labels=None)
     numbered = list(enumerate(blocks(inputs.pairs.pairs, options.block_images)))
-    records = [r for _, records in executor.run(job, numbered, lambda _: None, lambda _: None) for r in records]
+    records = [r for _, records in executor.run(job, numbered, lambda _: None) for r in records]
     assert {record.pair for record in records} == set(combinations(sorted(inputs.images), 2))
     return {record.pair: (content(record), record.error) for record in records}
 
@@ -115,5 +115,5 @@ def test_nothing_is_read_ahead_once_a_process_was_ended_from_outside(options, in
     job = MatchingJob(options=options, inputs=inputs, labels=None)
     order = (("0.png", "2.png"), ("0.png", "3.png"), ("1.png", "2.png"))
     executor = LocalExecutor(device="cpu", point_matcher=matcher)
-    list(executor.run(job, [(0, order)], lambda _: None, lambda _: None))
+    list(executor.run(job, [(0, order)], lambda _: None))
     assert told == [("0.png", 0), ("2.png", 0), ("3.png", 1), ("1.png", 2)]
