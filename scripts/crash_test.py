@@ -5,8 +5,9 @@
 The collection is the rendered room, small. A kill is SIGKILL to every process of the run (as a power cut or a job
 scheduler does it), to the supervisor alone (its children have to end by themselves), or to the process that matches
 (which has to be started again by itself, at most once for each output folder, since a pair that ends the process twice
-is given up); a stop is SIGTERM to the supervisor. After one kill in four the file that was written last is cut short too. A run that comes to its end is
-compared, and another one is begun in a new folder. Prints JSON; the exit code is 1 when any database differs.
+is given up), or SIGTERM to the supervisor. After one kill in four the file that was written last is cut short too. A
+run that comes to its end is compared, and another one is begun in a new folder. Prints JSON; the exit code is 1 when
+any database differs.
 """
 
 from __future__ import annotations
