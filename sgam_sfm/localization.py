@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -42,13 +42,13 @@ from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.machine import find_device
 from sgam_sfm.matching import create_area_matcher
 from sgam_sfm.options import MatchOptions, starting_options
-from sgam_sfm.pairs import PairList, blocks, read_pairs
+from sgam_sfm.pairs import Pair, PairList, blocks, read_pairs
 from sgam_sfm.progress import Stages
 from sgam_sfm.results import Results, open_results
 from sgam_sfm.run_record import recording
 from sgam_sfm.runner import open_store
 from sgam_sfm.stage_options import LocalizeOptions
-from sgam_sfm.store import PairRecord
+from sgam_sfm.store import PairRecord, PairStore
 from sgam_sfm.summary import versions
 
 _log = logging.getLogger(__name__)
@@ -100,13 +100,10 @@ def _localize(
     work = blocks(inputs.pairs.pairs, run.block_images)
     match_blocks(work, store, executor, MatchingJob(options=run, inputs=inputs, labels=labels), stages)
 
-    by_photo: dict[str, list[PairRecord]] = {name: [] for name in photos}
-    for record in store.read_all(len(work)):
-        by_photo[record.pair[0]].append(record)
     landmarks = lru_cache(None)(lambda name: landmarks_of(model, model.find_image_with_name(name)))
     queries: dict[str, _Query] = {}
     with stages.stage("Estimating poses", len(photos)) as advance:
-        for name, records in by_photo.items():
+        for name, records in _records_of(photos, store, work):
             parts = [_correspondences(record, landmarks, options, run) for record in records]
             queries[name] = _locate(inputs.cameras[name], records, joined(parts), options)
             advance(1)
@@ -129,6 +126,18 @@ def _localize(
     }
     written: dict[str, Any] = write_json(options.output / "localize.json", content)
     return written
+
+
+def _records_of(
+    photos: Iterable[str], store: PairStore, work: Sequence[Sequence[Pair]]
+) -> Iterator[tuple[str, list[PairRecord]]]:
+    """The records of each photo, those of one photo in memory at a time: blocks are read again for each of theirs."""
+    blocks_of: dict[str, list[int]] = {name: [] for name in photos}
+    for number, pairs in enumerate(work):
+        for name in {photo for photo, _ in pairs}:
+            blocks_of[name].append(number)
+    for name, numbers in blocks_of.items():
+        yield name, [record for number in numbers for record in store.read(number) if record.pair[0] == name]
 
 
 def _options_of_run(options: LocalizeOptions, results: Results) -> MatchOptions:
