@@ -22,13 +22,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sgam_core.types import Matches
-from sgam_sfm.database import write_database
-from sgam_sfm.image_import import CameraOptions, import_cameras
-from sgam_sfm.keypoints import KeypointOptions
-from sgam_sfm.mapping import map_images
-from sgam_sfm.merging import merge_keypoints
-from sgam_sfm.store import read_pairs_of
-from sgam_sfm.verification import verify
+from sgam_sfm.colmap.database import write_database
+from sgam_sfm.colmap.image_import import CameraOptions, import_cameras
+from sgam_sfm.colmap.mapping import map_images
+from sgam_sfm.colmap.verification import verify
+from sgam_sfm.merging.keypoints import KeypointOptions
+from sgam_sfm.merging.merge import merge_keypoints
+from sgam_sfm.runs.store import read_pairs_of
 
 Pair = tuple[str, str]
 

@@ -40,13 +40,13 @@ from sgam_sfm.images import read_image
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import LabelMaps, make_label_maps
 from sgam_sfm.machine import find_device, use_threads
-from sgam_sfm.matching import CollectionMatcher, create_area_matcher, create_matcher, reset
 from sgam_sfm.options import MatchOptions, with_preset
 from sgam_sfm.pairs import Pair, PairList, blocks, spread_over
 from sgam_sfm.progress import Stages
-from sgam_sfm.runner import assemble, open_store
-from sgam_sfm.store import PairRecord
-from sgam_sfm.summary import versions
+from sgam_sfm.runs.matching import CollectionMatcher, create_area_matcher, create_matcher, reset
+from sgam_sfm.runs.runner import assemble, open_store
+from sgam_sfm.runs.store import PairRecord
+from sgam_sfm.runs.summary import versions
 
 PLAIN = "none"
 MAX_PER_PIXEL = 1.1  # times plain's, at the same number of pixels

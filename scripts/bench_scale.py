@@ -33,14 +33,14 @@ from scipy.spatial import cKDTree
 
 from sgam_core import Area, AreaMatch, Box, Matches, PairResult, TwoViewModel
 from sgam_core.options import GeometryOptions
-from sgam_sfm.assembly import merged_records
-from sgam_sfm.database import write_database
+from sgam_sfm.colmap.database import write_database
 from sgam_sfm.files import write_json
 from sgam_sfm.hloc_files import write_keypoints_h5, write_matches_h5
-from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions
 from sgam_sfm.machine import peak_memory_mb
+from sgam_sfm.merging.keypoints import CollectionKeypoints, KeypointOptions
 from sgam_sfm.pairs import Pair, blocks
-from sgam_sfm.store import PairRecord, PairStore
+from sgam_sfm.runs.assembly import merged_records
+from sgam_sfm.runs.store import PairRecord, PairStore
 
 _STAGES = ("store", "merge")
 _WIDTH, _HEIGHT, _FOCAL = 1024, 768, 900.0

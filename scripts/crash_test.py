@@ -28,7 +28,7 @@ from typing import Any
 
 import psutil
 
-from sgam_sfm.colmap_reading import database_content
+from sgam_sfm.colmap.reading import database_content
 from sgam_sfm.exit_codes import DONE, INTERRUPTED, SOME_FAILED
 from sgam_sfm.scene import demo_views, write_scene
 

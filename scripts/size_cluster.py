@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from sgam_sfm.pairs import blocks
-from sgam_sfm.store import PairStore
+from sgam_sfm.runs.store import PairStore
 
 SAMPLED_IMAGES = 4000  # that blocks are made of, to know how many pairs and images they have
 

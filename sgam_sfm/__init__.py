@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sgam_sfm.options import MatchOptions
-    from sgam_sfm.runner import match_collection
+    from sgam_sfm.runs.runner import match_collection
 
 __all__ = ["MatchOptions", "match_collection"]
 
-_HOMES = {"MatchOptions": "sgam_sfm.options", "match_collection": "sgam_sfm.runner"}
+_HOMES = {"MatchOptions": "sgam_sfm.options", "match_collection": "sgam_sfm.runs.runner"}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,6 +1,6 @@
 """`python -m sgam_sfm` is the command `sgam-sfm`."""
 
-from sgam_sfm.supervision import main
+from sgam_sfm.runs.supervision import main
 
 if __name__ == "__main__":
     main()

@@ -1,4 +1,4 @@
-"""The command line: which command, its options, and how errors end it; `sgam_sfm.supervision.main` starts it."""
+"""The command line: which command, its options, and how errors end it; `sgam_sfm.runs.supervision.main` starts it."""
 
 from __future__ import annotations
 

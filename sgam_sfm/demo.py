@@ -7,16 +7,16 @@ from typing import Any
 
 from rich.console import Console
 
+from sgam_sfm.colmap.pose_errors import PoseErrors, compare_poses
 from sgam_sfm.files import write_json
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pictures import collection_picture, pair_picture, save_picture
-from sgam_sfm.pose_errors import PoseErrors, compare_poses
 from sgam_sfm.progress import Stages
-from sgam_sfm.results import open_results
-from sgam_sfm.runner import match_collection
+from sgam_sfm.runs.results import open_results
+from sgam_sfm.runs.runner import match_collection
+from sgam_sfm.runs.store import PairRecord, read_pairs_of
+from sgam_sfm.runs.summary import print_summary
 from sgam_sfm.scene import demo_views, write_scene
-from sgam_sfm.store import PairRecord, read_pairs_of
-from sgam_sfm.summary import print_summary
 
 _NUM_PICTURES = 4
 

@@ -20,10 +20,10 @@ from sgam_core.errors import SGAMError
 from sgam_sfm.machine import find_device
 from sgam_sfm.models import list_models
 from sgam_sfm.options import MatchOptions
-from sgam_sfm.runner import match_collection
+from sgam_sfm.runs.runner import match_collection
+from sgam_sfm.runs.store import read_pairs_of
+from sgam_sfm.runs.summary import versions
 from sgam_sfm.scene import correspond, demo_views, write_scene
-from sgam_sfm.store import read_pairs_of
-from sgam_sfm.summary import versions
 
 _LITTLE_MEMORY_GB, _LITTLE_DISK_GB = 3.0, 2.0
 _TEST_WIDTH, _TEST_VIEWS, _TEST_LABELS = 320, (3, 4), 8

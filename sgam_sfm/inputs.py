@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sgam_core.errors import InputError, OptionError
-from sgam_sfm.appending import require_no_descriptors
-from sgam_sfm.cameras import CameraInfo
-from sgam_sfm.image_import import CameraOptions, import_cameras
+from sgam_sfm.colmap.appending import require_no_descriptors
+from sgam_sfm.colmap.cameras import CameraInfo
+from sgam_sfm.colmap.image_import import CameraOptions, import_cameras
 from sgam_sfm.images import MAX_IMAGE_SIZE, ImageFile, image_format, inspect_image, list_images, printable
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import PairList, all_pairs, read_pairs

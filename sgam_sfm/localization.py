@@ -18,7 +18,7 @@ import pycolmap
 from sgam_core import PointMatcher
 from sgam_core.errors import InputError
 from sgam_core.geometry import residuals
-from sgam_sfm.absolute_pose import (
+from sgam_sfm.colmap.absolute_pose import (
     Correspondences,
     Landmarks,
     Pose,
@@ -27,29 +27,29 @@ from sgam_sfm.absolute_pose import (
     joined,
     landmarks_of,
 )
-from sgam_sfm.block_matching import match_blocks
-from sgam_sfm.cameras import CameraInfo, camera_of_info
-from sgam_sfm.colmap_reading import read_model
+from sgam_sfm.colmap.cameras import CameraInfo, camera_of_info
+from sgam_sfm.colmap.image_import import CameraOptions, import_cameras
+from sgam_sfm.colmap.reading import read_model
 from sgam_sfm.evaluation.ground_truth.camera_table import write_camera_table
 from sgam_sfm.evaluation.ground_truth.types import TrueView
 from sgam_sfm.executors import MatchingJob
 from sgam_sfm.executors.local import LocalExecutor
 from sgam_sfm.files import replacing, write_json
-from sgam_sfm.image_import import CameraOptions, import_cameras
 from sgam_sfm.images import inspect_image
 from sgam_sfm.inputs import Inputs, read_images
 from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.machine import find_device
-from sgam_sfm.matching import create_area_matcher
 from sgam_sfm.options import MatchOptions, starting_options
 from sgam_sfm.pairs import Pair, PairList, blocks, read_pairs
 from sgam_sfm.progress import Stages
-from sgam_sfm.results import Results, open_results
-from sgam_sfm.run_record import recording
-from sgam_sfm.runner import open_store
+from sgam_sfm.runs.block_matching import match_blocks
+from sgam_sfm.runs.matching import create_area_matcher
+from sgam_sfm.runs.results import Results, open_results
+from sgam_sfm.runs.run_record import recording
+from sgam_sfm.runs.runner import open_store
+from sgam_sfm.runs.store import PairRecord, PairStore
+from sgam_sfm.runs.summary import versions
 from sgam_sfm.stage_options import LocalizeOptions
-from sgam_sfm.store import PairRecord, PairStore
-from sgam_sfm.summary import versions
 
 _log = logging.getLogger(__name__)
 _MAX_REFERENCES = 60

@@ -16,8 +16,8 @@ from sgam_core import Crop, Matches, PointMatcher
 from sgam_core.errors import SGAMError
 from sgam_sfm.files import replacing
 from sgam_sfm.inputs import Inputs
-from sgam_sfm.matching import create_matcher, reset
 from sgam_sfm.options import MatchOptions, as_json
+from sgam_sfm.runs.matching import create_matcher, reset
 
 _log = logging.getLogger(__name__)
 

@@ -31,9 +31,9 @@ from sgam_core.options import (
     TurningOptions,
     ZoomOptions,
 )
-from sgam_sfm.keypoints import KeypointOptions
 from sgam_sfm.machine import Precision
-from sgam_sfm.shards import Shard
+from sgam_sfm.merging.keypoints import KeypointOptions
+from sgam_sfm.runs.shards import Shard
 
 Preset = Literal["default", "fast", "paper", "scannet", "outdoor"]
 _STAGES = tuple(stage.name for stage in fields(SGAMOptions))

@@ -8,23 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from sgam_core.errors import InputError, OptionError
-from sgam_sfm.appending import stamp_of
-from sgam_sfm.assembly import build_models, merged_records, verify_pairs, write_for_hloc
-from sgam_sfm.colmap_reading import read_camera_ids
-from sgam_sfm.database import copy_database, write_database
+from sgam_sfm.colmap.appending import stamp_of
+from sgam_sfm.colmap.database import copy_database, write_database
+from sgam_sfm.colmap.mapping import MappingOptions
+from sgam_sfm.colmap.reading import read_camera_ids
+from sgam_sfm.colmap.verification import VerificationOptions
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import refuse_among_images
 from sgam_sfm.machine import use_threads
-from sgam_sfm.mapping import MappingOptions
 from sgam_sfm.options import starting_options
 from sgam_sfm.progress import Stages
-from sgam_sfm.results import json_object, open_results
-from sgam_sfm.run_record import recording
-from sgam_sfm.runner import KNOWN_CAMERAS
+from sgam_sfm.runs.assembly import build_models, merged_records, verify_pairs, write_for_hloc
+from sgam_sfm.runs.results import json_object, open_results
+from sgam_sfm.runs.run_record import recording
+from sgam_sfm.runs.runner import KNOWN_CAMERAS
+from sgam_sfm.runs.store import read_pairs_of, stored_files
+from sgam_sfm.runs.summary import summarise_keypoints, versions
 from sgam_sfm.stage_options import AggregateOptions, ReconstructOptions
-from sgam_sfm.store import read_pairs_of, stored_files
-from sgam_sfm.summary import summarise_keypoints, versions
-from sgam_sfm.verification import VerificationOptions
 
 
 def reconstruct(options: ReconstructOptions, stages: Stages | None = None) -> dict[str, Any]:

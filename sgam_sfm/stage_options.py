@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from sgam_core.errors import OptionError
-from sgam_sfm.keypoints import KeypointOptions
+from sgam_sfm.merging.keypoints import KeypointOptions
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ def run(options: AggregateOptions, console: Console) -> int:
     """Merge and map; print what came out."""
     from sgam_sfm.progress import Stages
     from sgam_sfm.reconstruction import aggregate, source_of
-    from sgam_sfm.summary import print_models
+    from sgam_sfm.runs.summary import print_models
 
     with logging_to(source_of(options).output / "log.txt", console, verbose=options.verbose):
         content = aggregate(options, Stages(console=console))

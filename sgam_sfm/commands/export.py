@@ -10,10 +10,10 @@ from sgam_sfm.stage_options import ExportOptions
 
 def run(options: ExportOptions, console: Console) -> int:
     """Write the files; print the commands that read them."""
-    from sgam_sfm.colmap_reading import each_keypoints, each_matches, read_camera_ids
-    from sgam_sfm.colmap_text import require_plain_names, write_keypoints_text, write_matches_text
+    from sgam_sfm.colmap.reading import each_keypoints, each_matches, read_camera_ids
+    from sgam_sfm.colmap.text import require_plain_names, write_keypoints_text, write_matches_text
     from sgam_sfm.inputs import refuse_among_images
-    from sgam_sfm.results import open_results
+    from sgam_sfm.runs.results import open_results
 
     results = open_results(options.results, options.images)
     refuse_among_images(options.output, results.images)

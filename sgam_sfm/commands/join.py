@@ -11,9 +11,9 @@ from sgam_sfm.stage_options import JoinOptions
 
 def run(options: JoinOptions, console: Console) -> int:
     """Join, merge and map; print the summary."""
-    from sgam_sfm.joining import join, options_of
     from sgam_sfm.progress import Stages
-    from sgam_sfm.summary import print_summary
+    from sgam_sfm.runs.joining import join, options_of
+    from sgam_sfm.runs.summary import print_summary
 
     whole = options_of(options)  # before the log is begun
     with logging_to(options.output / "log.txt", console, verbose=options.verbose):

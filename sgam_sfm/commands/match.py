@@ -16,8 +16,8 @@ def run(options: MatchOptions, console: Console) -> int:
     from sgam_sfm.external import refuse_unused_script
     from sgam_sfm.inputs import refuse_among_images
     from sgam_sfm.progress import Stages
-    from sgam_sfm.runner import match_collection
-    from sgam_sfm.summary import print_shard, print_summary
+    from sgam_sfm.runs.runner import match_collection
+    from sgam_sfm.runs.summary import print_shard, print_summary
 
     refuse_unused_script(options, "matcher")
     refuse_unused_script(options, "segmenter")

@@ -13,7 +13,7 @@ def run(options: ReconstructOptions, console: Console) -> int:
     """Map; print the models."""
     from sgam_sfm.progress import Stages
     from sgam_sfm.reconstruction import reconstruct, source_of
-    from sgam_sfm.summary import print_models
+    from sgam_sfm.runs.summary import print_models
 
     with logging_to(source_of(options).output / "log.txt", console, verbose=options.verbose):
         content = reconstruct(options, Stages(console=console))

@@ -44,7 +44,7 @@ class ShowOptions:
 def run(options: ShowOptions, console: Console) -> int:
     """Draw the picture and print where it is."""
     from sgam_sfm.pictures import collection_picture, image_picture, pair_picture, save_picture
-    from sgam_sfm.results import find_plain, open_plain, open_results
+    from sgam_sfm.runs.results import find_plain, open_plain, open_results
 
     results = open_results(options.output, options.images)
     if len(options.names) == 2:

@@ -13,7 +13,7 @@ from rich.console import Console
 from sgam_sfm.exit_codes import DONE
 
 if TYPE_CHECKING:
-    from sgam_sfm.status import RunStatus
+    from sgam_sfm.runs.status import RunStatus
 
 _MAX_REASONS = 10
 
@@ -30,7 +30,7 @@ class StatusOptions:
 
 def run(options: StatusOptions, console: Console) -> int:
     """Print the status."""
-    from sgam_sfm.status import read_status
+    from sgam_sfm.runs.status import read_status
 
     status = read_status(options.output)
     if options.json:

@@ -23,11 +23,11 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import create_segmenter, write_label_maps
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import find_device
-from sgam_sfm.matching import create_area_matcher, create_matcher
 from sgam_sfm.options import MatchOptions, fingerprint
 from sgam_sfm.pairs import spread_over, write_pairs
 from sgam_sfm.progress import Stages
-from sgam_sfm.summary import versions
+from sgam_sfm.runs.matching import create_area_matcher, create_matcher
+from sgam_sfm.runs.summary import versions
 from sgam_sfm.tables import print_figures
 
 VERSION = 1

@@ -8,7 +8,7 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any, Literal
 
-from sgam_sfm.colmap_reading import read_poses_and_points
+from sgam_sfm.colmap.reading import read_poses_and_points
 from sgam_sfm.evaluation.metrics import pose_auc
 from sgam_sfm.evaluation.sfm_metrics import Poses, align, camera_errors, pairwise_pose_errors
 

@@ -19,8 +19,8 @@ from PIL import Image as PillowImage
 from pydantic import TypeAdapter
 
 from sgam_core.errors import InputError, OptionError
-from sgam_sfm.camera_files import write_cameras
-from sgam_sfm.cameras import CameraInfo, KnownCamera, camera_of_part
+from sgam_sfm.colmap.camera_files import write_cameras
+from sgam_sfm.colmap.cameras import CameraInfo, KnownCamera, camera_of_part
 from sgam_sfm.evaluation.ground_truth import TrueView
 from sgam_sfm.files import replacing, write_json
 from sgam_sfm.images import ImageFile, read_image, read_label_map, read_mask

@@ -12,22 +12,22 @@ from threading import Thread
 from typing import Any
 
 from sgam_core import match_whole
+from sgam_sfm.colmap.database import write_database
+from sgam_sfm.colmap.sift_baseline import match_sift
+from sgam_sfm.colmap.verification import VerificationOptions
 from sgam_sfm.comparison.budget import Budget, fit_budget
 from sgam_sfm.comparison.methods import Method
-from sgam_sfm.database import write_database
 from sgam_sfm.exit_codes import ERROR
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.logs import logging_to
 from sgam_sfm.match_cache import CachedMatcher
-from sgam_sfm.matching import CollectionMatcher, create_area_matcher
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.progress import Stages
-from sgam_sfm.run_record import recording
-from sgam_sfm.runner import match_collection, reconstruct
-from sgam_sfm.sift_baseline import match_sift
-from sgam_sfm.verification import VerificationOptions
+from sgam_sfm.runs.matching import CollectionMatcher, create_area_matcher
+from sgam_sfm.runs.run_record import recording
+from sgam_sfm.runs.runner import match_collection, reconstruct
 
 _log = logging.getLogger(__name__)
 

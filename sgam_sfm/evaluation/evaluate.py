@@ -26,12 +26,12 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import LabelMaps, make_label_maps
 from sgam_sfm.machine import find_device, use_threads
 from sgam_sfm.match_cache import CachedMatcher
-from sgam_sfm.matching import CollectionMatcher, create_area_matcher
 from sgam_sfm.nearest import did_you_mean
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair, spread_over, write_pairs
 from sgam_sfm.progress import Stages
-from sgam_sfm.summary import versions
+from sgam_sfm.runs.matching import CollectionMatcher, create_area_matcher
+from sgam_sfm.runs.summary import versions
 
 VERSION = 1
 _AMP_OVERLAP = 0.7

@@ -16,7 +16,7 @@ from sgam_sfm.inputs import Inputs
 from sgam_sfm.label_maps import LabelMaps
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
-from sgam_sfm.store import PairRecord
+from sgam_sfm.runs.store import PairRecord
 
 Begin = Callable[[Pair], None]
 

@@ -9,11 +9,11 @@ from typing import Any
 from sgam_core import PointMatcher
 from sgam_sfm.executors import Begin, MatchingJob
 from sgam_sfm.machine import find_device, use_threads
-from sgam_sfm.matching import CollectionMatcher, create_matcher, failed_record
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
-from sgam_sfm.store import PairRecord
-from sgam_sfm.supervised import given_up
+from sgam_sfm.runs.matching import CollectionMatcher, create_matcher, failed_record
+from sgam_sfm.runs.store import PairRecord
+from sgam_sfm.runs.supervised import given_up
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

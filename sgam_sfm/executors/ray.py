@@ -24,11 +24,11 @@ from sgam_sfm.executors import Begin, MatchingJob
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.label_maps import LabelMaps
 from sgam_sfm.machine import find_device, use_threads
-from sgam_sfm.matching import CollectionMatcher, create_matcher, special_labels
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair, PairList
-from sgam_sfm.store import PairRecord
-from sgam_sfm.summary import versions
+from sgam_sfm.runs.matching import CollectionMatcher, create_matcher, special_labels
+from sgam_sfm.runs.store import PairRecord
+from sgam_sfm.runs.summary import versions
 
 _log = logging.getLogger(__name__)
 _RETRIES = 5  # of a block whose worker died

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sgam_core.errors import InputError
-from sgam_sfm.colmap_reading import read_match_counts
+from sgam_sfm.colmap.reading import read_match_counts
 from sgam_sfm.hloc_files import read_match_counts_h5
 from sgam_sfm.pairs import Pair, read_pairs
 

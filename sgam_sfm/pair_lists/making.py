@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int
 
 from sgam_core.errors import InputError, OptionError
-from sgam_sfm.colmap_reading import read_observations
+from sgam_sfm.colmap.reading import read_observations
 from sgam_sfm.evaluation.ground_truth import read_ground_truth
 from sgam_sfm.files import replacing
 from sgam_sfm.images import inspect_image, list_images, printable

@@ -12,7 +12,7 @@ from sgam_sfm.pictures.canvas import ImageView
 from sgam_sfm.pictures.collection import CollectionPicture, ImageEntry, draw_collection
 from sgam_sfm.pictures.image import ImagePicture, draw_single_image
 from sgam_sfm.pictures.pair import Matching, PairPicture, draw_pair
-from sgam_sfm.results import Results
+from sgam_sfm.runs.results import Results
 
 _NO_DATABASE = "COLMAP's inliers (no database.db)"
 

@@ -17,7 +17,7 @@ from matplotlib.patheffects import withStroke
 
 from sgam_core.geometry import sampson_distance
 from sgam_core.types import AreaMatch, AreaState, PairResult, TwoViewModel
-from sgam_sfm.colmap_reading import MatchedPoints
+from sgam_sfm.colmap.reading import MatchedPoints
 from sgam_sfm.colours import distinct_colour
 from sgam_sfm.pictures.canvas import (
     DISTANCES,

@@ -15,10 +15,10 @@ import pytest
 
 from sgam_core.errors import InputError, OptionError, ShapeError
 from sgam_sfm import MatchOptions, match_collection
-from sgam_sfm.appending import append_to_database, replace_database, require_no_descriptors, stamp_of
-from sgam_sfm.colmap_reading import database_content, read_database
+from sgam_sfm.colmap.appending import append_to_database, replace_database, require_no_descriptors, stamp_of
+from sgam_sfm.colmap.image_import import CameraOptions, import_cameras
+from sgam_sfm.colmap.reading import database_content, read_database
 from sgam_sfm.comparison.options import CompareOptions
-from sgam_sfm.image_import import CameraOptions, import_cameras
 from tests.arc import ARC, CAMERA, CX, CY, FOCAL, ArcMatcher, write_arc
 
 NAMES = tuple(ARC)[:4]  # a.png .. d.png

@@ -13,7 +13,7 @@ import PIL.Image
 import pytest
 
 from sgam_sfm import cli
-from sgam_sfm.colmap_reading import read_database
+from sgam_sfm.colmap.reading import read_database
 from tests.textures import similarity, view
 
 DONE, ERROR, SOME_FAILED, NO_MODEL = 0, 1, 3, 4

@@ -15,20 +15,20 @@ from pathlib import Path
 import pytest
 
 from sgam_sfm import cli
-from sgam_sfm.colmap_reading import database_content
-from sgam_sfm.database import is_whole
+from sgam_sfm.colmap.database import is_whole
+from sgam_sfm.colmap.reading import database_content
 from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED, SOME_FAILED
-from sgam_sfm.matching import CollectionMatcher
 from sgam_sfm.progress import Stages
-from sgam_sfm.run_record import recording
-from sgam_sfm.store import stored_files
+from sgam_sfm.runs.matching import CollectionMatcher
+from sgam_sfm.runs.run_record import recording
+from sgam_sfm.runs.store import stored_files
 from tests.room import Room, write_room
 
 # Found by every Python process that is started with its folder on the path.
 KILLED_AT_A_PAIR = """
 import os, signal
 if os.environ.get("KILLED_AT"):
-    from sgam_sfm.matching import CollectionMatcher
+    from sgam_sfm.runs.matching import CollectionMatcher
     plain = CollectionMatcher.match
 
     def match(self, pair):
@@ -179,7 +179,7 @@ def test_memory_that_does_not_suffice_elsewhere_is_one_line(folder, output, monk
     def write(*arguments: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("sgam_sfm.runner.write_database", write)
+    monkeypatch.setattr("sgam_sfm.runs.runner.write_database", write)
     (output / "database.db").unlink()
     assert cli.run(arguments(folder, output)) == ERROR
     assert "error: memory does not suffice (MemoryError); lower --image-size or" in capsys.readouterr().err

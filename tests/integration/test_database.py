@@ -10,11 +10,11 @@ import PIL.Image
 import pytest
 
 from sgam_core.errors import InputError, OptionError, ShapeError
-from sgam_sfm.camera_files import read_cameras
-from sgam_sfm.cameras import CameraInfo, camera_matrix
-from sgam_sfm.colmap_reading import database_content, read_database
-from sgam_sfm.database import write_database
-from sgam_sfm.image_import import CameraOptions, import_cameras
+from sgam_sfm.colmap.camera_files import read_cameras
+from sgam_sfm.colmap.cameras import CameraInfo, camera_matrix
+from sgam_sfm.colmap.database import write_database
+from sgam_sfm.colmap.image_import import CameraOptions, import_cameras
+from sgam_sfm.colmap.reading import database_content, read_database
 
 
 @pytest.fixture

@@ -20,8 +20,8 @@ from sgam_sfm.external import WorkerCommand, WorkerError
 from sgam_sfm.images import ImageFile, inspect_image
 from sgam_sfm.matchers.external import ExternalMatcher
 from sgam_sfm.matchers.vismatch import vismatch
-from sgam_sfm.matching import create_matcher
 from sgam_sfm.options import MatchOptions, fingerprint, starting_options
+from sgam_sfm.runs.matching import create_matcher
 from sgam_sfm.segmenters.external import ExternalSegmenter
 from tests.textures import similarity, view, whole
 

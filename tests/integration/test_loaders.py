@@ -20,7 +20,7 @@ import PIL.Image
 import pycolmap
 import pytest
 
-from sgam_sfm.colmap_reading import database_content
+from sgam_sfm.colmap.reading import database_content
 
 NUM_PARAMS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
 """Of the camera models that nerfstudio and the fork know, by their number in the file."""

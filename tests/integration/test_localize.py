@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 
 from sgam_sfm import MatchOptions, cli, match_collection
-from sgam_sfm.colmap_reading import read_poses_and_points
+from sgam_sfm.colmap.reading import read_poses_and_points
 from sgam_sfm.evaluation.ground_truth import camera_table
 from sgam_sfm.exit_codes import DONE, ERROR, NO_MODEL, SOME_FAILED, USAGE
 from sgam_sfm.room.rendering import View

@@ -13,11 +13,11 @@ import h5py
 import pytest
 
 from sgam_sfm import cli
-from sgam_sfm.colmap_reading import database_content
+from sgam_sfm.colmap.reading import database_content
 from sgam_sfm.exit_codes import DONE, ERROR, SOME_FAILED, USAGE
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import write_pairs
-from sgam_sfm.runner import match_collection
+from sgam_sfm.runs.runner import match_collection
 from tests.room import Room, TrueMatcher, write_room
 
 PAIRS = 6  # of four images, a block each

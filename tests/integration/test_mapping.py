@@ -14,11 +14,11 @@ import pycolmap
 import pytest
 
 from sgam_core.errors import InputError, OptionError, StageError
-from sgam_sfm.colmap_reading import database_content, read_database
-from sgam_sfm.database import write_database
-from sgam_sfm.image_import import CameraOptions, ImportedImages, import_cameras
-from sgam_sfm.mapping import MappingOptions, map_images
-from sgam_sfm.verification import VerificationOptions, verify
+from sgam_sfm.colmap.database import write_database
+from sgam_sfm.colmap.image_import import CameraOptions, ImportedImages, import_cameras
+from sgam_sfm.colmap.mapping import MappingOptions, map_images
+from sgam_sfm.colmap.reading import database_content, read_database
+from sgam_sfm.colmap.verification import VerificationOptions, verify
 
 NAMES = tuple(f"{i}.jpg" for i in range(6))
 WIDTH, HEIGHT, FOCAL, CX, CY = 640, 480, 520.0, 331.0, 229.5  # corner origin
@@ -271,7 +271,7 @@ def test_an_unguarded_script_can_verify(tmp_path):
     (tmp_path / "script").mkdir()
     script = tmp_path / "script/run.py"
     script.write_text(
-        "import sys, pathlib\nfrom sgam_sfm.verification import verify\n"
+        "import sys, pathlib\nfrom sgam_sfm.colmap.verification import verify\n"
         "print(len(verify(pathlib.Path(sys.argv[1])).inliers))\n"
     )
     done = subprocess.run(

@@ -16,9 +16,9 @@ import PIL.Image
 import pytest
 
 from sgam_sfm import cli
-from sgam_sfm.colmap_reading import database_content
+from sgam_sfm.colmap.pose_errors import compare_poses
+from sgam_sfm.colmap.reading import database_content
 from sgam_sfm.exit_codes import DONE, ERROR, SOME_FAILED, USAGE
-from sgam_sfm.pose_errors import compare_poses
 from sgam_sfm.scene import write_ground_truth
 from tests.room import Room, write_room
 

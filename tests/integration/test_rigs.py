@@ -11,9 +11,9 @@ import pytest
 
 from sgam_core.errors import InputError, OptionError
 from sgam_sfm import MatchOptions, match_collection
-from sgam_sfm.camera_files import read_cameras
-from sgam_sfm.colmap_reading import read_model
-from sgam_sfm.image_import import CameraOptions, import_cameras
+from sgam_sfm.colmap.camera_files import read_cameras
+from sgam_sfm.colmap.image_import import CameraOptions, import_cameras
+from sgam_sfm.colmap.reading import read_model
 from sgam_sfm.reconstruction import reconstruct
 from sgam_sfm.room.rendering import View
 from sgam_sfm.stage_options import ReconstructOptions

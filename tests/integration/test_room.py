@@ -21,7 +21,7 @@ from sgam_core import (
     match_described,
 )
 from sgam_core.options import changed
-from sgam_sfm.merging import merge_keypoints
+from sgam_sfm.merging.merge import merge_keypoints
 from sgam_sfm.scene import correspond
 from tests.room import Room, TrueMatcher
 

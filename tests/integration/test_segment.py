@@ -13,7 +13,7 @@ import pytest
 
 from sgam_core.errors import WeightsError
 from sgam_sfm import cli, registry
-from sgam_sfm.colmap_reading import database_content
+from sgam_sfm.colmap.reading import database_content
 from sgam_sfm.exit_codes import DONE, ERROR, SOME_FAILED, USAGE
 from sgam_sfm.images import read_label_map
 from sgam_sfm.inputs import read_images
@@ -22,8 +22,8 @@ from sgam_sfm.label_set import read_label_set
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.progress import Stages
 from sgam_sfm.room.furniture import LABELS
+from sgam_sfm.runs.store import read_pairs_of
 from sgam_sfm.segmenters.ade20k import CLASSES
-from sgam_sfm.store import read_pairs_of
 from tests.paths import weights_of
 from tests.room import Room, write_room
 

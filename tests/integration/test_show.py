@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sgam_sfm import cli
-from sgam_sfm.colmap_reading import (
+from sgam_sfm.colmap.reading import (
     read_counts,
     read_database,
     read_keypoints,
@@ -21,7 +21,7 @@ from sgam_sfm.colmap_reading import (
 from sgam_sfm.commands import show
 from sgam_sfm.exit_codes import DONE, ERROR, USAGE
 from sgam_sfm.pictures import image_picture, pair_picture
-from sgam_sfm.results import find_plain, open_results
+from sgam_sfm.runs.results import find_plain, open_results
 from tests.room import Room, write_room
 
 

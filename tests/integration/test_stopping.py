@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from sgam_sfm import cli
-from sgam_sfm.colmap_reading import database_content
+from sgam_sfm.colmap.reading import database_content
 from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED
 from tests.room import Room, write_room
 

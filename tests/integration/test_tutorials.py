@@ -15,7 +15,7 @@ import pycolmap
 import pytest
 
 from sgam_core.errors import InputError
-from sgam_sfm.colmap_reading import database_content
+from sgam_sfm.colmap.reading import database_content
 from sgam_sfm.images import inspect_image
 from sgam_sfm.pairs import read_pairs
 from tests.textures import similarity, transfer, view, whole

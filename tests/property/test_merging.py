@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sgam_core.types import Matches
-from sgam_sfm.keypoints import CollectionKeypoints, KeypointOptions
-from sgam_sfm.merging import merge_keypoints
-from sgam_sfm.tracks import Tracks
+from sgam_sfm.merging.keypoints import CollectionKeypoints, KeypointOptions
+from sgam_sfm.merging.merge import merge_keypoints
+from sgam_sfm.merging.tracks import Tracks
 
 NAMES = ("a", "b", "c", "d")
 
@@ -98,10 +98,10 @@ def test_the_order_of_pairs_changes_nothing_and_a_reversed_pair_has_reversed_mat
 def test_the_size_of_the_pieces_changes_nothing(pairs, matches_at_once, rows_a_part):
     expected = merge_keypoints(pairs)
     with (
-        mock.patch("sgam_sfm.merging._AT_ONCE", matches_at_once),
-        mock.patch("sgam_sfm.merging._ROWS_A_PART", rows_a_part),
-        mock.patch("sgam_sfm.scratch._BUFFERED", 8 * rows_a_part),
-        mock.patch("sgam_sfm.scratch._ROWS_AT_ONCE", rows_a_part),
+        mock.patch("sgam_sfm.merging.merge._AT_ONCE", matches_at_once),
+        mock.patch("sgam_sfm.merging.merge._ROWS_A_PART", rows_a_part),
+        mock.patch("sgam_sfm.merging.scratch._BUFFERED", 8 * rows_a_part),
+        mock.patch("sgam_sfm.merging.scratch._ROWS_AT_ONCE", rows_a_part),
     ):
         merged = merge_keypoints(pairs)
     for name in expected.keypoints:
@@ -166,7 +166,7 @@ def test_joining_is_what_it_says(seed, most_rearranged):
     edges, half = rng.integers(0, count, (num_edges, 2)), num_edges // 2
     made = Tracks(points, images, sigmas, radius)
     made.join(edges[:half])
-    with mock.patch("sgam_sfm.tracks._MOST_REARRANGED", most_rearranged):
+    with mock.patch("sgam_sfm.merging.tracks._MOST_REARRANGED", most_rearranged):
         made.join_tracks(np.array_split(edges[half:], 2), min_shared=1)
     needed = [(a, b, int(row >= half)) for row, (a, b) in enumerate(edges.tolist())]
     root, stands = one_after_the_other(points, images, sigmas, needed, radius)

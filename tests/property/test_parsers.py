@@ -16,16 +16,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sgam_core.errors import SGAMError
-from sgam_sfm.camera_files import read_cameras
+from sgam_sfm.colmap.camera_files import read_cameras
+from sgam_sfm.colmap.rigs import read_rigs
 from sgam_sfm.evaluation.ground_truth import FORMATS, read_ground_truth
 from sgam_sfm.hloc_files import read_global_descriptors, read_match_counts_h5
 from sgam_sfm.images import inspect_image, read_label_map
 from sgam_sfm.label_set import read_label_set
 from sgam_sfm.options import MatchOptions, as_json, starting_options
 from sgam_sfm.pairs import read_pairs
-from sgam_sfm.rigs import read_rigs
-from sgam_sfm.run_record import read_run_record
-from sgam_sfm.store import read_outcomes
+from sgam_sfm.runs.run_record import read_run_record
+from sgam_sfm.runs.store import read_outcomes
 
 # A larger number finds more: python -m pytest tests/property/test_parsers.py with FUZZ=5000
 FUZZ = settings(

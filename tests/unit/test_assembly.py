@@ -1,7 +1,7 @@
 import numpy as np
 
-from sgam_sfm import assembly
-from sgam_sfm.keypoints import CollectionKeypoints
+from sgam_sfm.merging.keypoints import CollectionKeypoints
+from sgam_sfm.runs import assembly
 
 
 def test_a_large_matches_file_is_left_out_with_a_warning_unless_it_is_asked_for(tmp_path, monkeypatch, caplog):

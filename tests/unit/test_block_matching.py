@@ -13,14 +13,14 @@ import pytest
 
 from sgam_core import Matches, PairResult
 from sgam_core.errors import InputError
-from sgam_sfm import block_matching
-from sgam_sfm.block_matching import match_blocks
 from sgam_sfm.executors import Begin, MatchingJob
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair, PairList
 from sgam_sfm.progress import Stages
-from sgam_sfm.store import PairRecord, PairStore, stored_files
+from sgam_sfm.runs import block_matching
+from sgam_sfm.runs.block_matching import match_blocks
+from sgam_sfm.runs.store import PairRecord, PairStore, stored_files
 
 NAMES = "abcdefg"
 WORK = tuple(tuple((name, str(number)) for number in range(4)) for name in NAMES[:2])

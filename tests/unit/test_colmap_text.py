@@ -11,10 +11,10 @@ import pytest
 
 from sgam_core.errors import InputError
 from sgam_sfm import cli
-from sgam_sfm.colmap_text import write_keypoints_text, write_matches_text
-from sgam_sfm.database import write_database
+from sgam_sfm.colmap.database import write_database
+from sgam_sfm.colmap.image_import import import_cameras
+from sgam_sfm.colmap.text import write_keypoints_text, write_matches_text
 from sgam_sfm.exit_codes import DONE, ERROR
-from sgam_sfm.image_import import import_cameras
 
 KEYPOINTS = {
     "a.jpg": np.array([[0.5, 0.5], [1234.5678, 2.25]], np.float32),

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sgam_sfm.differences import difference
+from sgam_sfm.runs.differences import difference
 
 INPUTS = {"images": {"a.jpg": "1", "b.jpg": "2"}, "pairs": [["a.jpg", "b.jpg"]]}
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sgam_core.errors import InputError, OptionError
-from sgam_sfm.cameras import CameraInfo, camera_of_part
+from sgam_sfm.colmap.cameras import CameraInfo, camera_of_part
 from sgam_sfm.comparison.harder import Cut, Window, cut_collection, cut_folder, parse_cut, read_windows
 from sgam_sfm.evaluation.ground_truth import TrueView
 from sgam_sfm.inputs import read_inputs

@@ -3,12 +3,12 @@ import pytest
 
 from sgam_core.errors import InputError, OptionError, ShapeError
 from sgam_core.types import Matches
-from sgam_sfm.affine import local_affine
-from sgam_sfm.alignment import align_keypoints, offsets_of
-from sgam_sfm.clusters import merge_image
-from sgam_sfm.keypoints import KeypointOptions
-from sgam_sfm.merging import merge_keypoints, merging
-from sgam_sfm.tracks import Tracks
+from sgam_sfm.merging.affine import local_affine
+from sgam_sfm.merging.alignment import align_keypoints, offsets_of
+from sgam_sfm.merging.clusters import merge_image
+from sgam_sfm.merging.keypoints import KeypointOptions
+from sgam_sfm.merging.merge import merge_keypoints, merging
+from sgam_sfm.merging.tracks import Tracks
 from tests.textures import similarity, transfer, view
 
 

@@ -12,7 +12,7 @@ import PIL.Image
 import pytest
 
 from sgam_core import Crop, Matches
-from sgam_sfm import matching, read_ahead, supervised
+from sgam_sfm import read_ahead
 from sgam_sfm.executors import MatchingJob
 from sgam_sfm.executors.local import LocalExecutor
 from sgam_sfm.images import read_image
@@ -20,7 +20,8 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import blocks
 from sgam_sfm.progress import Stages
-from sgam_sfm.store import PairRecord
+from sgam_sfm.runs import matching, supervised
+from sgam_sfm.runs.store import PairRecord
 
 NUM_IMAGES = 7
 

@@ -15,9 +15,9 @@ import pytest
 from sgam_core.errors import OptionError, WeightsError
 from sgam_sfm import cli, models, registry
 from sgam_sfm.exit_codes import DONE, ERROR, USAGE
-from sgam_sfm.matching import create_matcher
 from sgam_sfm.models import CARDS, ModelCard, get_weights, list_models, require_licence
 from sgam_sfm.options import MatchOptions
+from sgam_sfm.runs.matching import create_matcher
 from sgam_sfm.weights import COARSE_LOFTR, find_weights, hub_checkpoints
 
 CONTENT = b"weights of a toy"

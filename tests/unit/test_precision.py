@@ -13,9 +13,9 @@ from sgam_sfm.executors.ray import on_this_cpu
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.match_cache import CachedMatcher
 from sgam_sfm.matchers.xfeat import XFeatStar
-from sgam_sfm.matching import create_matcher
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import PairList
+from sgam_sfm.runs.matching import create_matcher
 
 
 class Plain:

@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 
 from sgam_core.errors import InputError, OptionError, StageError
-from sgam_sfm.cameras import CameraInfo
+from sgam_sfm.colmap.cameras import CameraInfo
 from sgam_sfm.executors import MatchingJob, open_executor, ray
 from sgam_sfm.images import ImageFile
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair, PairList
-from sgam_sfm.store import PairRecord
+from sgam_sfm.runs.store import PairRecord
 
 
 class RayError(Exception):

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sgam_sfm.refinement import refine
+from sgam_sfm.colmap.refinement import refine
 
 WRONG = range(1, 151)  # points of which two images alone see something, and not the same
 

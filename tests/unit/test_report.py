@@ -19,15 +19,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sgam_core.types import Area, AreaMatch, Box, Matches, PairResult
+from sgam_sfm.colmap.database import write_database
+from sgam_sfm.colmap.image_import import CameraOptions, import_cameras
 from sgam_sfm.comparison.figures import FIGURES
 from sgam_sfm.comparison.harder import Window
 from sgam_sfm.comparison.report import Bounds, geometry, plots, table, write_report
 from sgam_sfm.comparison.report.gallery import extremes, make_gallery, thumbnails
 from sgam_sfm.comparison.report.runs import MethodRun, PairFacts, read_matches, read_run
-from sgam_sfm.database import write_database
 from sgam_sfm.evaluation.sfm_metrics import Similarity
-from sgam_sfm.image_import import CameraOptions, import_cameras
-from sgam_sfm.store import PairRecord, PairStore
+from sgam_sfm.runs.store import PairRecord, PairStore
 
 NAMES = ("\"&'.jpg", "<script>.jpg", "c.jpg", "sub/d.jpg")
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0

@@ -15,8 +15,8 @@ from sgam_core.errors import InputError
 from sgam_core.types import Area, AreaMatch, AreaState, Box, Matches, PairResult, TwoViewModel
 from sgam_sfm.commands.show import ShowOptions, default_path
 from sgam_sfm.pictures import collection_picture, image_picture, pair_picture
-from sgam_sfm.results import find_plain, open_plain, open_results, swapped
-from sgam_sfm.store import PairRecord, PairStore
+from sgam_sfm.runs.results import find_plain, open_plain, open_results, swapped
+from sgam_sfm.runs.store import PairRecord, PairStore
 
 NAMES = ("a.jpg", "b c.jpg", "sub/ü$_.jpg", "d.jpg")
 AREA = AreaMatch(

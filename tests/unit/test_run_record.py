@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from sgam_core.errors import InputError, StageError
-from sgam_sfm import run_record
 from sgam_sfm.progress import Stages, duration
-from sgam_sfm.run_record import read_run_record, recording
-from sgam_sfm.supervision import Terminated
+from sgam_sfm.runs import run_record
+from sgam_sfm.runs.run_record import read_run_record, recording
+from sgam_sfm.runs.supervision import Terminated
 
 
 def test_a_run_tells_its_stage_while_it_lasts(tmp_path):
@@ -52,7 +52,7 @@ def test_a_second_run_in_the_same_folder_is_refused(tmp_path):
 
 def test_a_killed_run_is_told_from_a_running_one(tmp_path):
     code = (
-        "import sys, os, signal; from pathlib import Path; from sgam_sfm.run_record import recording;"
+        "import sys, os, signal; from pathlib import Path; from sgam_sfm.runs.run_record import recording;"
         "from sgam_sfm.progress import Stages; stages = Stages(quiet=True);"
         "run = recording(Path(sys.argv[1]), stages); run.__enter__();"
         "stage = stages.stage('Mapping', 3); stage.__enter__(); os.kill(os.getpid(), signal.SIGKILL)"

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from sgam_sfm import scratch
-from sgam_sfm.scratch import Scratch, batches, in_order
+from sgam_sfm.merging import scratch
+from sgam_sfm.merging.scratch import Scratch, batches, in_order
 
 
 def test_rows_are_read_as_they_were_written_and_the_folder_goes_even_after_an_error(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 
 from sgam_core.errors import OptionError
 from sgam_sfm.pairs import blocks
-from sgam_sfm.shards import Shard
+from sgam_sfm.runs.shards import Shard
 
 
 @pytest.mark.parametrize("text", ["", "2", "0/4", "5/4", "1/0", "-1/4", "1/4/2", "a/b", "1.5/4", "²/4"])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sgam_sfm.sorting import stable_order
+from sgam_sfm.merging.sorting import stable_order
 
 
 @pytest.mark.parametrize("top", [3, 500, 2**15, 2**40])

@@ -15,7 +15,7 @@ import pytest
 
 from sgam_core import Area, AreaMatch, Box, Matches, PairResult, TwoViewModel
 from sgam_core.errors import InputError
-from sgam_sfm.store import PairRecord, PairStore, read_outcomes, read_pair_outcomes
+from sgam_sfm.runs.store import PairRecord, PairStore, read_outcomes, read_pair_outcomes
 
 PAIRS = (("a.jpg", "b.jpg"), ("a.jpg", "c.jpg"))
 

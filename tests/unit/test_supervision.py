@@ -13,14 +13,14 @@ from dataclasses import asdict
 import psutil
 import pytest
 
-from sgam_sfm import supervision
 from sgam_sfm.exit_codes import ERROR, INTERRUPTED
-from sgam_sfm.supervised import Crash
-from sgam_sfm.supervision import supervise
+from sgam_sfm.runs import supervision
+from sgam_sfm.runs.supervised import Crash
+from sgam_sfm.runs.supervision import supervise
 
 CHILD = """
 import json, os, signal, sys, time
-from sgam_sfm import supervised
+from sgam_sfm.runs import supervised
 supervised.begin(json.loads(sys.stdin.buffer.readline())["crashes"], int(sys.argv[1]))
 """
 TWO_PAIRS = """
@@ -83,10 +83,10 @@ def test_exit_codes_are_those_of_the_run(child, code):
 
 REAL = """
 import sys
-from sgam_sfm import supervision
+from sgam_sfm.runs import supervision
 supervision._PROGRAM = '''
 import time, types
-from sgam_sfm import supervision
+from sgam_sfm.runs import supervision
 
 def run(arguments):
     try:
@@ -142,9 +142,8 @@ def test_a_run_ends_with_its_supervisor(begun):
 
 
 def test_the_supervisor_imports_the_standard_library_only():
-    code = (
-        "import sys; import sgam_sfm.supervision; print([m for m in ('numpy', 'rich', 'pydantic') if m in sys.modules])"
-    )
+    heavy = ("numpy", "rich", "pydantic")
+    code = f"import sys; import sgam_sfm.runs.supervision; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -16,14 +16,14 @@ from matplotlib.figure import Figure
 
 from sgam_core import Matches, PairResult
 from sgam_core.errors import InputError
-from sgam_sfm.colmap_reading import read_pair_inliers
+from sgam_sfm.colmap.reading import read_pair_inliers
 from sgam_sfm.comparison.report.bounds import Bounds, evenly_of
 from sgam_sfm.comparison.report.runs import MethodRun, has_store, read_matches
 from sgam_sfm.images import read_image
 from sgam_sfm.pairs import Pair
 from sgam_sfm.pictures.canvas import WIDTH, ImageView
 from sgam_sfm.pictures.pair import Matching, PairPicture, draw_pair
-from sgam_sfm.results import Results, open_results
+from sgam_sfm.runs.results import Results, open_results
 
 _QUALITY = 72
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sgam_core.errors import InputError
-from sgam_sfm.colmap_reading import read_poses_and_points
+from sgam_sfm.colmap.reading import read_poses_and_points
 from sgam_sfm.comparison.harder import Window, cut_views
 from sgam_sfm.comparison.report.bounds import Bounds, evenly_of
 from sgam_sfm.comparison.report.runs import MethodRun, PairMatches, read_matches

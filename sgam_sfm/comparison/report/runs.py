@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sgam_sfm.colmap_reading import read_counts, read_match_counts, read_pair_matches
+from sgam_sfm.colmap.reading import read_counts, read_match_counts, read_pair_matches
 from sgam_sfm.pairs import Pair
-from sgam_sfm.store import PairRecord, PairStore, read_pair_outcomes, read_pairs_of
+from sgam_sfm.runs.store import PairRecord, PairStore, read_pair_outcomes, read_pairs_of
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,0 +1,1 @@
+"""All that speaks to COLMAP: its databases, cameras, verification, mappers and models."""

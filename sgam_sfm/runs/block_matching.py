@@ -1,0 +1,84 @@
+"""Match the blocks of pairs that the store does not hold yet, wherever the executor does so, into the store."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
+
+from sgam_sfm.executors import Executor, MatchingJob
+from sgam_sfm.pairs import Pair
+from sgam_sfm.progress import Stages
+from sgam_sfm.runs.store import PairRecord, PairStore, read_outcomes
+
+_MOST_LOST_SECONDS = 30.0  # of matching, besides the pair in work
+
+
+def match_blocks(
+    work: Sequence[Sequence[Pair]],
+    store: PairStore,
+    executor: Executor,
+    job: MatchingJob,
+    stages: Stages,
+    numbers: Collection[int] | None = None,
+) -> dict[str, float]:
+    """Match every block that the store does not hold yet, and give the seconds that each step took, of all workers.
+
+    A block follows from its pairs and the options alone: the point matcher starts each one with empty caches, so that
+    what it did before cannot decide how it batches. What is done of a block is kept twice a minute and when the run is
+    stopped, so that a stop costs little however slow the matcher is.
+
+    Args: numbers: of the blocks to see to; all of them by default.
+    """
+    wanted = range(len(work)) if numbers is None else numbers
+    kept = {number for number in wanted if store.has(number, work[number])}
+    count_outcomes(stages, store, kept)
+    missing = [number for number in wanted if number not in kept]
+    opened = {number: records for number in missing if (records := store.begun(number, work[number]))}
+    for records in opened.values():
+        _count(stages, records)
+    waiting = [(number, work[number][len(opened.get(number, ())) :]) for number in missing]
+    num_pairs = sum(len(work[number]) for number in wanted)
+    seconds: dict[str, float] = {}
+    with stages.stage("Matching pairs", num_pairs, num_pairs - sum(len(rest) for _, rest in waiting)) as advance:
+        saved = time.monotonic()
+        try:
+            for number, found in executor.run(job, waiting, stages.working_on):
+                records = opened.setdefault(number, [])
+                records += found
+                if len(records) == len(work[number]):
+                    store.write(number, opened.pop(number))
+                    saved = time.monotonic()
+                elif time.monotonic() - saved > _MOST_LOST_SECONDS:
+                    store.write_begun(number, records)
+                    saved = time.monotonic()
+                _count(stages, found)
+                for record in found:
+                    for step, spent in (record.result.seconds if record.result else {}).items():
+                        seconds[step] = seconds.get(step, 0.0) + spent
+                advance(len(found))
+        except BaseException:
+            with suppress(OSError):  # what stops the run is to be told, and may be a full disk
+                for number, records in opened.items():
+                    store.write_begun(number, records)
+            raise
+    return seconds
+
+
+def count_outcomes(stages: Stages, store: PairStore, blocks: Iterable[int]) -> None:
+    """Count how the pairs of blocks that are done have ended."""
+    for block in blocks:
+        for outcome in read_outcomes(store.path(block)):
+            stages.counts.update(_counted(outcome.error, outcome.fallback))
+
+
+def _count(stages: Stages, records: Iterable[PairRecord]) -> None:
+    for record in records:
+        stages.counts.update(_counted(record.error, record.result.fallback if record.result else ""))
+
+
+def _counted(error: str, fallback: str) -> tuple[str, ...]:
+    """How a pair ended, in the words of heartbeats."""
+    if error:
+        return ("pairs_failed",)
+    return ("pairs_done", "fallbacks") if fallback else ("pairs_done",)
