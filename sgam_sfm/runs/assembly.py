@@ -22,7 +22,9 @@ from sgam_sfm.colmap.verification import VerificationOptions, VerificationSummar
 from sgam_sfm.hloc_files import matches_h5_size, write_keypoints_h5, write_matches_h5
 from sgam_sfm.images import read_image
 from sgam_sfm.merging.keypoints import CollectionKeypoints, KeypointOptions
-from sgam_sfm.merging.merge import Photos, RawPair, merging
+from sgam_sfm.merging.merge import merging
+from sgam_sfm.merging.raw import RawPair
+from sgam_sfm.merging.settling import Photos
 from sgam_sfm.progress import Advance, Stages
 from sgam_sfm.runs.store import PairRecord
 

@@ -98,8 +98,9 @@ def test_the_order_of_pairs_changes_nothing_and_a_reversed_pair_has_reversed_mat
 def test_the_size_of_the_pieces_changes_nothing(pairs, matches_at_once, rows_a_part):
     expected = merge_keypoints(pairs)
     with (
-        mock.patch("sgam_sfm.merging.merge._AT_ONCE", matches_at_once),
-        mock.patch("sgam_sfm.merging.merge._ROWS_A_PART", rows_a_part),
+        mock.patch("sgam_sfm.merging.raw._AT_ONCE", matches_at_once),
+        mock.patch("sgam_sfm.merging.linking.ROWS_A_PART", rows_a_part),
+        mock.patch("sgam_sfm.merging.settling.ROWS_A_PART", rows_a_part),
         mock.patch("sgam_sfm.merging.scratch._BUFFERED", 8 * rows_a_part),
         mock.patch("sgam_sfm.merging.scratch._ROWS_AT_ONCE", rows_a_part),
     ):
