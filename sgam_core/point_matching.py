@@ -5,10 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from sgam_core.crops import box_crop, warped_alike, whole_crop
+from sgam_core.errors import ShapeError
 from sgam_core.looks import Look
 from sgam_core.options import CropOptions
 from sgam_core.prediction import Estimate, MatchedArea
@@ -143,16 +145,50 @@ class PairPoints:
         start = time.perf_counter()
         matched = self.matcher.match(crops)
         self.seconds += time.perf_counter() - start
-        return [
-            Matches(
-                points0=crop0.to_image(found.points0),
-                points1=crop1.to_image(found.points1),
-                scores=found.scores,
-                sigmas0=found.sigmas0 / np.float32(crop0.scale),
-                sigmas1=found.sigmas1 / np.float32(crop1.scale),
+        _require_as_agreed(self.matcher, crops, matched)
+        return [self._in_image(*pair, found) for pair, found in zip(crops, matched, strict=True)]
+
+    def _in_image(self, crop0: Crop, crop1: Crop, found: Matches) -> Matches:
+        """Matches of two crops in image pixels, without those outside of the crops."""
+        inside = _inside(crop0, found.points0) & _inside(crop1, found.points1)
+        if not inside.all():
+            outside = (
+                f"{len(inside) - inside.sum()} of {len(inside)} matches of a crop lie outside of it, and are dropped"
             )
-            for (crop0, crop1), found in zip(crops, matched, strict=True)
-        ]
+            self.notes += (outside,)
+            found = found.select(inside)
+        return Matches(
+            points0=crop0.to_image(found.points0),
+            points1=crop1.to_image(found.points1),
+            scores=found.scores,
+            sigmas0=found.sigmas0 / np.float32(crop0.scale),
+            sigmas1=found.sigmas1 / np.float32(crop1.scale),
+        )
+
+
+def _require_as_agreed(matcher: PointMatcher, crops: Sequence[tuple[Crop, Crop]], matched: Any) -> None:
+    """Refuse what a point matcher may not return. Raises: ShapeError."""
+
+    def wrong(what: str) -> ShapeError:
+        return ShapeError(f"the point matcher {type(matcher).__name__} gave {what}")
+
+    if not isinstance(matched, Sequence) or not all(isinstance(found, Matches) for found in matched):
+        given = {type(found).__name__ for found in matched} if isinstance(matched, Sequence) else {"no list"}
+        raise wrong(f"{', '.join(sorted(given))}; expected a list of sgam_core.Matches, one for each pair of crops")
+    if len(matched) != len(crops):
+        raise wrong(f"{len(matched)} Matches for {len(crops)} pairs of crops; expected one for each")
+    for found in matched:
+        if not all(np.isfinite(array).all() for array in (found.points0, found.points1, found.scores)):
+            raise wrong("points or scores that are not finite; it is to leave such matches out")
+        if len(found) and not (found.scores.min() >= 0 and found.scores.max() <= 1):
+            raise wrong(f"scores from {found.scores.min():.3g} to {found.scores.max():.3g}; expected [0, 1]")
+        if not (np.minimum(found.sigmas0, found.sigmas1) > 0).all():
+            raise wrong("sigmas that are not above 0")
+
+
+def _inside(crop: Crop, points: np.ndarray) -> np.ndarray:
+    inside: np.ndarray = np.all((points >= 0) & (points <= crop.size), axis=1)
+    return inside
 
 
 def _scaled_crop(image: Image, box: Box, scale: float) -> Crop:

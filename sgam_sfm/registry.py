@@ -16,6 +16,8 @@ KINDS = {
 }
 """The option that names a model, and the entry-point group it is looked up in."""
 
+_VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
 
 def available(kind: str) -> dict[str, EntryPoint]:
     """Every installed entry point of a kind, by name, sorted."""
@@ -63,7 +65,18 @@ def create(kind: str, name: str, **settings: Any) -> Any:
         if colon and not rest:
             raise OptionError(f"--{kind} '{name}' names no model; give one after the colon: a hub id or a folder")
         settings |= {"name": rest} if colon else {}
+        needed = [key for key, value in taken.items() if value.default is value.empty and value.kind not in _VARIADIC]
+        if unknown := [key for key in needed if key not in settings]:
+            raise OptionError(
+                f"--{kind} '{name}': its constructor needs '{unknown[0]}', which no option gives; let it have a default"
+            )
         return factory(**{key: value for key, value in settings.items() if key in taken})
+    except AttributeError as error:
+        if hasattr(error.obj, "__file__") and error.name in entry.attr.split("."):
+            raise OptionError(
+                f"--{kind} '{name}': there is no '{entry.value}', as its package says ({error})"
+            ) from error
+        raise
     except ModuleNotFoundError as error:
         raise OptionError(f"--{kind} '{name}' needs the package '{error.name}'; run `{install(entry)}`") from error
 

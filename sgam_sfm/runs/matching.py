@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import traceback
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from sgam_core import AreaMatcher, Image, PairResult, PointMatcher, WholeImages, match_described
@@ -107,7 +109,7 @@ class CollectionMatcher:
             yield
 
     def match(self, pair: Pair) -> PairRecord:
-        """The record of one pair; an error of its images becomes part of it.
+        """The record of one pair; whatever stops it becomes part of it, such as a fault in somebody's point matcher.
 
         Raises: StageError when the point matcher is at its end, and not only this pair.
         """
@@ -117,6 +119,9 @@ class CollectionMatcher:
             raise
         except SGAMError as error:
             return failed_record(pair, str(error))
+        except Exception as error:
+            _log.info("%s - %s failed", *pair, exc_info=error)
+            return failed_record(pair, f"{_told(error)}; the log has the traceback")
         return PairRecord(pair=pair, result=result)
 
     def _match_within_memory(self, pair: Pair) -> PairResult:
@@ -168,3 +173,10 @@ class CollectionMatcher:
     def _describe(self, name: str) -> Any:
         labels = None if self._labels is None else self._labels.read(name)
         return self._area_matcher.describe(self.image(name), labels)
+
+
+def _told(error: Exception) -> str:
+    """An exception that nobody foresaw, and where it was raised, in one line."""
+    raised = traceback.extract_tb(error.__traceback__)[-1]
+    message = (str(error).splitlines() or [""])[0]
+    return f"{type(error).__name__}: {message} ({Path(raised.filename).name}:{raised.lineno})"

@@ -34,7 +34,7 @@ class MeanMatcher:
 
     def match(self, pairs: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
         self.calls += [(crop0.image.name, crop1.image.name) for crop0, crop1 in pairs]
-        means = [[crop.pixels()[..., :2].mean((0, 1)) for crop in pair] for pair in pairs]
+        means = [[crop.pixels()[..., :2].mean((0, 1)) / 12 for crop in pair] for pair in pairs]
         return [Matches(points0=a[None], points1=b[None], scores=np.ones(1)) for a, b in means]
 
 
@@ -100,6 +100,27 @@ def test_memory_that_does_not_suffice_for_an_image_once(options, inputs, monkeyp
 
     monkeypatch.setattr(matching, "read_image", read)
     assert matched(options, inputs) == expected
+
+
+def test_a_fault_in_somebodys_matcher_is_the_reason_of_its_pairs_alone(options, inputs, monkeypatch, caplog):
+    expected = matched(options, inputs)
+    plain = MeanMatcher.match
+
+    def match(self, pairs):
+        if pairs[0][0].image.name == "2.png":
+            raise ValueError("a late bug\nwith more to tell")
+        return plain(self, pairs)
+
+    monkeypatch.setattr(MeanMatcher, "match", match)
+    caplog.set_level("INFO")
+    for pair, (points, error) in matched(options, inputs).items():
+        if pair[0] == "2.png":
+            assert error.startswith("ValueError: a late bug (test_matching_ahead.py:")
+            assert error.endswith("; the log has the traceback")
+        else:
+            assert (points, error) == expected[pair]
+    assert "with more to tell" in caplog.text
+    assert "Traceback (most recent call last)" in caplog.text
 
 
 def test_nothing_is_read_ahead_once_a_process_was_ended_from_outside(options, inputs, monkeypatch):
