@@ -282,6 +282,6 @@ def test_an_unguarded_script_can_verify(tmp_path):
 
 def test_png_can_be_written_after_the_import():
     """pycolmap's wheel carries a zlib that breaks the system's when pycolmap is loaded first."""
-    code = "from sgam_sfm import database, mappers\nimport zlib\nprint(len(zlib.compress(b'abc' * 1000)) < 100)"
+    code = "from sgam_sfm.colmap import database, mappers\nimport zlib\nprint(len(zlib.compress(b'abc' * 1000)) < 100)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"
