@@ -29,6 +29,7 @@ from sgam_sfm.runs.supervised import crashes
 
 _log = logging.getLogger(__name__)
 _DESCRIPTIONS_IN_MEMORY = 1024  # about 1 MB each
+_MOST_FAULTS = 3  # that nobody foresaw, before there is any result
 
 
 def create_matcher(options: MatchOptions) -> PointMatcher:
@@ -95,6 +96,7 @@ class CollectionMatcher:
         self._area_matcher = create_area_matcher(options, ignored)
         self.image = ReadAhead(self._read_image, 2 * options.block_images)  # those of one block
         self._description = lru_cache(_DESCRIPTIONS_IN_MEMORY)(self._describe)
+        self._faults, self._any_result = 0, False
 
     @contextmanager
     def block(self, pairs: Sequence[Pair]) -> Iterator[None]:
@@ -111,7 +113,8 @@ class CollectionMatcher:
     def match(self, pair: Pair) -> PairRecord:
         """The record of one pair; whatever stops it becomes part of it, such as a fault in somebody's point matcher.
 
-        Raises: StageError when the point matcher is at its end, and not only this pair.
+        Raises: StageError when the point matcher is at its end, and not only this pair; what nobody foresaw, when it
+            is all that has come of this matcher so far.
         """
         try:
             result = self._match_within_memory(pair)
@@ -120,8 +123,12 @@ class CollectionMatcher:
         except SGAMError as error:
             return failed_record(pair, str(error))
         except Exception as error:
+            self._faults += 1
+            if "CUDA error" in str(error) or (self._faults == _MOST_FAULTS and not self._any_result):
+                raise  # nothing will work in this process any more, or nothing ever did
             _log.info("%s - %s failed", *pair, exc_info=error)
             return failed_record(pair, f"{_told(error)}; the log has the traceback")
+        self._any_result = True
         return PairRecord(pair=pair, result=result)
 
     def _match_within_memory(self, pair: Pair) -> PairResult:

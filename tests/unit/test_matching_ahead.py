@@ -123,6 +123,24 @@ def test_a_fault_in_somebodys_matcher_is_the_reason_of_its_pairs_alone(options, 
     assert "Traceback (most recent call last)" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("good", "message", "tried"), [(0, "a bug", 3), (1, "CUDA error: unspecified launch failure", 2)]
+)
+def test_a_matcher_that_never_works_ends_the_run(options, inputs, monkeypatch, good, message, tried):
+    calls = []
+
+    def match(self, pairs):
+        calls.append(pairs)
+        if len(calls) > good:
+            raise RuntimeError(message)
+        return [Matches.empty()]
+
+    monkeypatch.setattr(MeanMatcher, "match", match)
+    with pytest.raises(RuntimeError, match=message):
+        matched(options, inputs)
+    assert len(calls) == tried
+
+
 def test_nothing_is_read_ahead_once_a_process_was_ended_from_outside(options, inputs, monkeypatch):
     """A pair is judged by what ends its process, and that must not be the image of another pair."""
     told: list[tuple[str, int]] = []
