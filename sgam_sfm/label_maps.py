@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int32
@@ -20,7 +21,7 @@ from sgam_sfm.colours import distinct_colour
 from sgam_sfm.external import WorkerCommand
 from sgam_sfm.files import replacing, write_json
 from sgam_sfm.images import ImageFile, read_label_map
-from sgam_sfm.label_set import RECORD, Label, LabelSet, at_size_of, read_label_set
+from sgam_sfm.label_set import LARGEST_ID, RECORD, Label, LabelSet, at_size_of, has_aspect, read_label_set
 from sgam_sfm.machine import find_device
 from sgam_sfm.options import MatchOptions, SegmentOptions
 from sgam_sfm.progress import Stages
@@ -119,12 +120,14 @@ def write_label_maps(
     """
     failed: dict[str, str] = {}
     pixels: Counter[int] = Counter()
+    usable: set[str] = set()
     with stages.stage("Segmenting images", len(images)) as advance:
         for file, made in segmenter.segment(tuple(images.values()), advance):
-            if isinstance(made, Exception):
-                failed[file.name] = str(made)
-                _log.warning("%s", made)
+            if reason := _unusable(file, made, type(segmenter).__name__):
+                failed[file.name] = reason
+                _log.warning("%s", reason)
                 continue
+            made = np.asarray(made, np.int32)
             labels = layout_labels(made)
             counts = dict(zip(*(part.tolist() for part in np.unique(labels, return_counts=True)), strict=True))
             if len(counts) > _MAX_LABELS_OF_IMAGE:
@@ -134,7 +137,12 @@ def write_label_maps(
                 )
                 continue
             pixels.update(counts)
-            _write_label_map(folder / f"{file.name}.png", file.name, at_size_of(file, made) if full_size else labels)
+            _write_label_map(folder / f"{file.name}.png", at_size_of(file, made) if full_size else labels)
+            usable.add(file.name)
+    for missing in images.keys() - failed.keys() - usable:
+        failed[missing] = f"the segmenter {type(segmenter).__name__} gave nothing for '{missing}'"
+    if images and not usable:
+        raise InputError(f"none of the {len(images)} images has a label map that can be used: {min(failed.items())[1]}")
     given: LabelSet = getattr(segmenter, "label_set", LabelSet())
     known = {label.id: label for label in given.labels}
     total = max(sum(pixels.values()), 1)
@@ -166,10 +174,21 @@ def _facts(segmenter: Segmenter) -> dict[str, object]:
     return {name: getattr(segmenter, name) for name in names if hasattr(segmenter, name)}
 
 
-def _write_label_map(path: Path, name: str, labels: Int32[np.ndarray, "H W"]) -> None:
-    largest = int(labels.max())
-    if largest > 65535:
-        raise InputError(f"labels of '{name}' go up to {largest}; expected ids of at most 16 bits (65535)")
-    depth = np.uint8 if largest < 256 else np.uint16
+def _unusable(file: ImageFile, made: Any, segmenter: str) -> str:
+    """Why what a segmenter gave for an image is no label map of it; empty when it is one."""
+    if isinstance(made, Exception):
+        return str(made)
+    given = f"{made.dtype} {made.shape}" if isinstance(made, np.ndarray) else type(made).__name__
+    expected = f"expected integers ({file.height}, {file.width}), or another size of the same aspect"
+    if not isinstance(made, np.ndarray) or made.dtype.kind not in "iu" or not has_aspect(made, file):
+        return f"the segmenter {segmenter} gave {given} for '{file.name}'; {expected}"
+    if made.min() < 0 or made.max() > LARGEST_ID:
+        between = f"from {made.min()} to {made.max()}"
+        return f"the segmenter {segmenter} gave ids {between} for '{file.name}'; expected 0 (unknown) to {LARGEST_ID}"
+    return ""
+
+
+def _write_label_map(path: Path, labels: Int32[np.ndarray, "H W"]) -> None:
+    depth = np.uint8 if int(labels.max()) < 256 else np.uint16
     with replacing(path) as partial:
         PillowImage.fromarray(labels.astype(depth)).save(partial, format="PNG")

@@ -20,7 +20,9 @@ def read_tensors(path: Path, what: str) -> dict[str, Any]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises a different type for every way in which a file can be wrong
-        raise WeightsError(f"'{path}' cannot be loaded as {what} weights ({str(error).splitlines()[0]})") from error
+        raise WeightsError(
+            f"'{path}' cannot be loaded as {what} weights: it is no file of tensors by torch, or damaged"
+        ) from error
     if not isinstance(content, dict):
         raise WeightsError(f"'{path}' holds no state dict of {what} but a {type(content).__name__}")
     return {str(key): value for key, value in content.items()}

@@ -40,6 +40,8 @@ def create_matcher(options: MatchOptions) -> PointMatcher:
     require_licence("matcher", options.matcher, options.accept_licence)
     if options.precision != "auto" and not registry.takes("matcher", options.matcher, "precision"):
         raise OptionError(f"--precision {options.precision}: '{options.matcher}' has no choice of it; leave it out")
+    if options.weights is not None and not registry.takes("matcher", options.matcher, "weights"):
+        raise OptionError(f"--weights '{options.weights}': '{options.matcher}' has none; leave it out")
     matcher: PointMatcher = registry.create(
         "matcher",
         options.matcher,

@@ -11,7 +11,7 @@ from jaxtyping import Int32
 
 from sgam_core.errors import InputError, SGAMError
 from sgam_sfm.images import MAX_IMAGE_SIZE, ImageFile, read_label_map
-from sgam_sfm.label_set import Label, LabelSet, at_size_of, read_label_set
+from sgam_sfm.label_set import Label, LabelSet, at_size_of, has_aspect, read_label_set
 from sgam_sfm.label_tables import APART, LabelTable, find_table
 
 
@@ -86,5 +86,11 @@ class LabelFolder:
                 f"labels for '{image.name}' are {labels.shape[0]}x{labels.shape[1]} but the image is "
                 f"{image.height}x{image.width} (height x width); export them again at the image's size, or pass "
                 "--resize-labels"
+            )
+        if not has_aspect(labels, image):
+            raise InputError(
+                f"labels for '{image.name}' are {labels.shape[0]}x{labels.shape[1]} but the image is "
+                f"{image.height}x{image.width} (height x width), of another aspect; export them again, turned as the "
+                "image is stored"
             )
         return at_size_of(image, labels)
