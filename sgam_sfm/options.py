@@ -249,10 +249,12 @@ class SegmentOptions:
     """Show the log on the terminal."""
 
 
-NOT_IN_RESULTS = frozenset(
+AFTER_MATCHING = frozenset({"refine_intrinsics", "mapper", "mapping", "keypoints"})
+"""Options that keypoints, database and model follow from, and nothing before them."""
+NOT_IN_RESULTS = AFTER_MATCHING | frozenset(
     {"images", "pairs", "cameras", "rigs", "output", "config", "threads", "verbose", "log_json", "accept_licence"}
     | {"executor", "ray_address", "shard"}
-    | {"refine_intrinsics", "mapper", "mapping", "keypoints", "database", "append", "max_image_size", "worker_timeout"}
+    | {"database", "append", "max_image_size", "worker_timeout"}
 )
 """Options that the raw results of pairs do not follow from: a run can be continued with others. The images, pairs and
 cameras themselves count, wherever they are."""

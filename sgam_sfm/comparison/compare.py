@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
@@ -23,10 +22,11 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import create_segmenter, write_label_maps
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import find_device
-from sgam_sfm.options import MatchOptions, fingerprint
+from sgam_sfm.options import AFTER_MATCHING, MatchOptions, as_json, fingerprint
 from sgam_sfm.pairs import spread_over, write_pairs
 from sgam_sfm.progress import Stages
 from sgam_sfm.runs.matching import create_area_matcher, create_matcher
+from sgam_sfm.runs.results import json_object
 from sgam_sfm.runs.summary import versions
 from sgam_sfm.tables import print_figures
 
@@ -54,6 +54,7 @@ def compare(options: CompareOptions, console: Console) -> dict[str, Any]:
     pairs = spread_over(inputs.pairs.pairs, options.max_pairs)
     write_pairs(options.output / "pairs.txt", pairs)
     common = replace(common, pairs=options.output / "pairs.txt")
+    inputs = replace(inputs, pairs=replace(inputs.pairs, pairs=tuple(pairs)))
     names = sorted({name for pair in pairs for name in pair})
     windows = read_windows(cut_folder(options.output, cut))
     views = {} if truth is None else cut_views(truth.views_of(names), windows)
@@ -105,20 +106,54 @@ def _labels(
 
 
 def _run(job: Job, inputs: Inputs, true: Poses) -> dict[str, Any]:
-    """Run a method, unless its result is there already; figures are taken anew, since the truth may be another one."""
-    path = job.options.output / "result.json"
-    mark = fingerprint(job.options, images=inputs.digests, budget=(job.target, job.max_image_size))
-    result = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    if result.get("fingerprint") != mark:
-        result = run_apart(job) | {"fingerprint": mark}
-        write_json(path, result)
+    """Run a method, unless its result is there already; figures are taken anew, since the truth may be another one.
+
+    What was matched is kept where only options of merging and mapping are others.
+    Raises: OptionError when the method's folder was begun with other pairs, options of matching or cameras.
+    """
     folder = job.options.output
+    path = folder / "result.json"
+    matching, whole = _marks(job, inputs)
+    result = json_object(path)
+    if result.get("fingerprint") != whole:
+        before = result if job.method.matcher and result.get("matching") == matching else {}
+        (folder / "summary.json").unlink(missing_ok=True)  # keypoints, database and model are made anew
+        result = _with_price_of(before, run_apart(job)) | {"matching": matching, "fingerprint": whole}
+        write_json(path, result)
     return result | {
         "seed": job.options.seed,
         "folder": str(folder),
         "figures": figures_of(result, folder, true),
         "times": times_of(result),
     }
+
+
+def _marks(job: Job, inputs: Inputs) -> tuple[str, str]:
+    """Of all that a method's matches follow from, and of all that its figures do."""
+    rigs = job.options.rigs
+    given = {
+        "images": inputs.digests,
+        "pairs": inputs.pairs.pairs,
+        "cameras": inputs.cameras,
+        "budget": (job.target, job.max_image_size),
+    }
+    late = {name: value for name, value in as_json(job.options).items() if name in AFTER_MATCHING}
+    late |= {} if rigs is None else {"rigs": rigs.read_text(encoding="utf-8")}
+    return fingerprint(job.options, **given), fingerprint(job.options, **given, late=late)
+
+
+def _with_price_of(before: Mapping[str, Any], result: dict[str, Any]) -> dict[str, Any]:
+    """A result charged with what its matches cost when they were made, by the one that made them (empty: it did)."""
+    if not before:
+        return result
+    there, summary = before["summary"], result["summary"]
+    matching = {
+        "seconds": summary["seconds"] | {"Matching pairs": there["seconds"]["Matching pairs"]},
+        "matching_seconds": there["matching_seconds"],
+        "peak_memory_mb": summary["peak_memory_mb"] | {"matching": there["peak_memory_mb"]["matching"]},
+    }
+    price = {name: before[name] for name in ("pixels_extracted", "saved_seconds")}
+    return result | price | {"summary": summary | matching}
 
 
 def _content(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import PIL.Image
@@ -90,6 +91,42 @@ def test_started_again_it_runs_nothing_that_is_there(folder, compared):
     assert cli.run(["compare", *common(folder, compared), "--no-report", "--methods", *METHODS]) == DONE
     assert summaries == {path: path.stat().st_mtime_ns for path in compared.glob("*/summary.json")}
     assert without_times(content_of(compared)) == before
+
+
+@pytest.fixture
+def begun(compared, tmp_path) -> Path:
+    """A finished comparison that a test may go on from."""
+    return Path(shutil.copytree(compared, tmp_path / "out"))
+
+
+def test_other_options_of_mapping_make_the_model_anew_from_the_matches_that_are_there(folder, begun):
+    names = ("none:xfeat-star", "sift")
+    stored = {path: path.stat().st_mtime_ns for path in begun.glob("none_xfeat-star/pairs/*")}
+    before = {method["name"]: method for method in content_of(begun)["methods"]}
+    again = ["compare", *common(folder, begun), "--no-report", "--methods", *names]
+    assert cli.run([*again, "--keypoints.track-radius-px", "0", "--no-mapping"]) == DONE
+    after = {method["name"]: method for method in content_of(begun)["methods"]}
+    for name in names:
+        assert before[name]["figures"]["registered"]["mean"] == 4
+        assert after[name]["figures"]["registered"]["mean"] == 0
+    plain, made = before["none:xfeat-star"], after["none:xfeat-star"]
+    assert stored
+    assert stored == {path: path.stat().st_mtime_ns for path in begun.glob("none_xfeat-star/pairs/*")}
+    assert made["figures"]["megapixels_matched"] == plain["figures"]["megapixels_matched"]
+    assert made["figures"]["megapixels_extracted"] == plain["figures"]["megapixels_extracted"]
+    assert made["times"]["matching_seconds"] == plain["times"]["matching_seconds"]
+
+
+def test_figures_of_other_pairs_are_never_shown(folder, begun, capsys):
+    fewer = ["compare", *common(folder, begun), "--no-report", "--max-pairs", "3", "--methods"]
+    assert cli.run([*fewer, "none:xfeat-star"]) == USAGE
+    error = capsys.readouterr().err
+    assert "none_xfeat-star' was begun with other pairs (3 only there," in error
+    assert "choose a new --output folder" in error
+    assert cli.run([*fewer, "sift"]) == DONE  # which keeps no matches of its own to go on from
+    content = content_of(begun)
+    assert content["collection"]["num_pairs"] == 3
+    assert content["methods"][0]["figures"]["verified_pairs"]["mean"] <= 3
 
 
 def test_matches_of_crops_are_shared_between_methods(compared):
