@@ -364,6 +364,11 @@ def as_json(options: MatchOptions) -> dict[str, Any]:
     return {VERSION: version("sgam-sfm")} | content
 
 
+def told_options(options: MatchOptions) -> dict[str, Any]:
+    """The resolved options as records of figures tell them: all but where and how loudly they are written."""
+    return {name: value for name, value in as_json(options).items() if name not in {"output", "verbose", "log_json"}}
+
+
 def fingerprint(options: MatchOptions, **inputs: Any) -> str:
     """A digest of the options that the results of pairs follow from, and of the inputs."""
     relevant = {name: value for name, value in as_json(options).items() if name not in NOT_IN_RESULTS}

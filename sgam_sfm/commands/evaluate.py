@@ -54,6 +54,10 @@ def _print(content: Mapping[str, Any], console: Console) -> None:
     ]
     names = [variant["name"] for variant in variants]
     print_figures(f"{content['num_pairs']} pairs", names, rows, console)
+    if not any(pair["by_depth"] for variant in variants for pair in variant["pairs"]):
+        console.print(
+            "MMA is by the symmetric epipolar distance: the truth has no depth for these pairs", soft_wrap=True
+        )
     degrees = content["auc_degrees"][len(content["auc_degrees"]) // 2]
     parts = zip(*(variant["slices"] for variant in variants), strict=True)  # a slice is the same pairs in all
     rows = [

@@ -22,7 +22,7 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import create_segmenter, write_label_maps
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import find_device
-from sgam_sfm.options import AFTER_MATCHING, MatchOptions, as_json, fingerprint
+from sgam_sfm.options import AFTER_MATCHING, MatchOptions, as_json, fingerprint, told_options
 from sgam_sfm.pairs import spread_over, write_pairs
 from sgam_sfm.progress import Stages
 from sgam_sfm.runs.matching import create_area_matcher, create_matcher
@@ -45,6 +45,7 @@ def compare(options: CompareOptions, console: Console) -> dict[str, Any]:
     common = replace(common, device=str(find_device(options.device, "--device")))
     for matcher in sorted({method.matcher for method in methods if method.matcher}):
         create_matcher(replace(common, matcher=matcher))  # what one lacks is said now, not after hours
+    given = common
     stages = Stages(console=console)
     inputs = read_inputs(replace(common, output=options.output / "inputs"), stages)
     if str(cut):
@@ -77,7 +78,7 @@ def compare(options: CompareOptions, console: Console) -> dict[str, Any]:
                 max_image_size=options.budget_image_size,
             )
             results[method.slug].append(_run(job, inputs, poses))
-    content = _content(common.images, cut, methods, names, len(pairs), truth, results)
+    content = _content(given, common.images, cut, methods, names, len(pairs), truth, results)
     written: dict[str, Any] = write_json(options.output / "compare.json", content)
     return written
 
@@ -123,7 +124,7 @@ def _run(job: Job, inputs: Inputs, true: Poses) -> dict[str, Any]:
     return result | {
         "seed": job.options.seed,
         "folder": str(folder),
-        "figures": figures_of(result, folder, true),
+        "figures": figures_of(result, folder, true, by_areas=job.method.area_matcher not in ("", "none")),
         "times": times_of(result),
     }
 
@@ -157,6 +158,7 @@ def _with_price_of(before: Mapping[str, Any], result: dict[str, Any]) -> dict[st
 
 
 def _content(
+    given: MatchOptions,
     images: Path,
     cut: Cut,
     methods: Sequence[Method],
@@ -165,6 +167,7 @@ def _content(
     truth: GroundTruth | None,
     results: Mapping[str, Sequence[Mapping[str, Any]]],
 ) -> dict[str, Any]:
+    options = told_options(given)
     figures = {slug: over_seeds([run["figures"] for run in runs]) for slug, runs in results.items()}
     times = {slug: over_seeds([run["times"] for run in runs]) for slug, runs in results.items()}
     plain = (method for method in methods if method.area_matcher == "none" and not method.same_budget)
@@ -179,11 +182,13 @@ def _content(
             "num_pairs": num_pairs,
             "ground_truth": known,
         },
+        "options": {name: value for name, value in options.items() if name not in ("area_matcher", "matcher")},
         "reference": reference.slug,
         "methods": [
             {
                 "name": method.name,
                 "slug": method.slug,
+                "options": _own(told_options(method.applied(given, given.output, given.seed)), options),
                 "figures": figures[method.slug],
                 "verdicts": _verdicts(figures[method.slug], figures[reference.slug]),
                 "times": times[method.slug],
@@ -193,6 +198,15 @@ def _content(
             for method in methods
         ],
         "versions": versions(),
+    }
+
+
+def _own(options: Mapping[str, Any], common: Mapping[str, Any]) -> dict[str, Any]:
+    """What a method has besides the common options, nested as they are; which matchers it has in any case."""
+    return {
+        name: _own(value, common[name]) if isinstance(value, dict) and isinstance(common.get(name), dict) else value
+        for name, value in options.items()
+        if name in ("area_matcher", "matcher") or value != common.get(name)
     }
 
 

@@ -34,6 +34,7 @@ FIGURES = (
     Figure(name="observations", title="observations", better="more"),
     Figure(name="images_per_track", title="images a track", better="more", digits=2),
     Figure(name="reprojection_error_px", title="reprojection, px", better="less", digits=3),
+    Figure(name="pairs_by_areas", title="pairs matched by areas, %", digits=0),
     Figure(name="verified_pairs", title="verified pairs", better="more"),
     Figure(name="inliers", title="inliers", better="more"),
     Figure(name="inlier_ratio", title="inlier ratio", better="more", digits=3),
@@ -48,11 +49,11 @@ TIMES = (
 """Figures that differ between two runs with one seed."""
 
 
-def figures_of(result: Mapping[str, Any], folder: Path, true: Poses) -> dict[str, float | None]:
+def figures_of(result: Mapping[str, Any], folder: Path, true: Poses, *, by_areas: bool) -> dict[str, float | None]:
     """The figures of a run that do not depend on the machine; None for those that there is nothing to take from.
 
     Args: result: of `running.run_method`. folder: the run's output, for its model. true: known poses of the
-        images; those without a pose in the model count as failed.
+        images; those without a pose in the model count as failed. by_areas: whether the method looks for areas at all.
     """
     summary = result["summary"]
     pairs, models = summary["pairs"], summary["models"]
@@ -64,6 +65,7 @@ def figures_of(result: Mapping[str, Any], folder: Path, true: Poses) -> dict[str
         "observations": model.get("observations", 0),
         "images_per_track": model.get("mean_images_per_track"),
         "reprojection_error_px": model.get("mean_reprojection_error_px"),
+        "pairs_by_areas": _by_areas(pairs) if by_areas else None,
         "verified_pairs": pairs["verified"],
         "inliers": pairs["inliers"],
         "inlier_ratio": pairs["inliers"] / matches if matches else None,
@@ -73,6 +75,11 @@ def figures_of(result: Mapping[str, Any], folder: Path, true: Poses) -> dict[str
     if len(true) > 1:
         figures |= _against_truth(folder / "sparse" / "0" if models else None, true)
     return figures
+
+
+def _by_areas(pairs: Mapping[str, Any]) -> float | None:
+    """Percentage of the matched pairs that did not fall back to whole images."""
+    return 100 * (1 - sum(pairs["fallbacks"].values()) / pairs["matched"]) if pairs["matched"] else None
 
 
 def times_of(result: Mapping[str, Any]) -> dict[str, float | None]:

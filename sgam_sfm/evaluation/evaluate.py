@@ -27,7 +27,7 @@ from sgam_sfm.label_maps import LabelMaps, make_label_maps
 from sgam_sfm.machine import find_device, use_threads
 from sgam_sfm.match_cache import CachedMatcher
 from sgam_sfm.nearest import did_you_mean
-from sgam_sfm.options import MatchOptions
+from sgam_sfm.options import MatchOptions, told_options
 from sgam_sfm.pairs import Pair, spread_over, write_pairs
 from sgam_sfm.progress import Stages
 from sgam_sfm.runs.matching import CollectionMatcher, create_area_matcher
@@ -110,9 +110,11 @@ def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
     for variant in variants:
         with stages.stage(variant.name, len(pairs)) as advance:
             judged[variant.name] = _judge(variant, inputs, labels, matcher, pairs, truth, names, whole, advance)
+    by_areas = {variant.name: variant.options.area_matcher != "none" for variant in variants}
     content = {
         "version": VERSION,
         "ground_truth": {"path": str(truth.source), "format": truth.format, "unit": truth.unit},
+        "options": told_options(replace(common, pairs=options.pairs)),
         "num_pairs": len(pairs),
         "num_labels": len(labels.set.labels) if labels else 0,
         "auc_degrees": options.auc_degrees,
@@ -120,9 +122,9 @@ def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
         "variants": [
             {
                 "name": name,
-                "figures": figures_of(list(results.values()), options.auc_degrees),
+                "figures": figures_of(list(results.values()), options.auc_degrees, by_areas=by_areas[name]),
                 "seconds": _seconds(list(results.values())),
-                "slices": _sliced(results, facts, options.auc_degrees),
+                "slices": _sliced(results, facts, options.auc_degrees, by_areas=by_areas[name]),
                 "pairs": [{"pair": pair, **asdict(facts[pair]), **asdict(result)} for pair, result in results.items()],
             }
             for name, results in judged.items()
@@ -133,8 +135,11 @@ def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
     return written
 
 
-def figures_of(pairs: Sequence[JudgedPair], auc_degrees: Sequence[float]) -> dict[str, float | None]:
-    """The metrics of some pairs: means over pairs for matches, over areas for areas; None where there is nothing."""
+def figures_of(pairs: Sequence[JudgedPair], auc_degrees: Sequence[float], *, by_areas: bool) -> dict[str, float | None]:
+    """The metrics of some pairs: means over pairs for matches, over areas for areas; None where there is nothing.
+
+    Args: by_areas: whether areas were looked for at all; otherwise there is nothing to fall back from.
+    """
     if not pairs:
         return {}
     figures: dict[str, float | None] = {"matches": fmean(pair.num_matches for pair in pairs)}
@@ -157,7 +162,7 @@ def figures_of(pairs: Sequence[JudgedPair], auc_degrees: Sequence[float]) -> dic
             known = [value for value in values if not np.isnan(value)]
             figures[f"aor_{name}{way}"] = 100 * fmean(known) if known else None
             figures[f"amp_{name}{way}"] = 100 * area_matching_precision(known, _AMP_OVERLAP) if known else None
-    figures["fallbacks"] = 100 * fmean(bool(pair.fallback) for pair in pairs)
+    figures["fallbacks"] = 100 * fmean(bool(pair.fallback) for pair in pairs) if by_areas else None
     figures["megapixels_matched"] = fmean(pair.pixels_matched for pair in pairs) / 1e6
     return figures
 
@@ -223,7 +228,8 @@ def _require_true_sizes(inputs: Inputs, truth: GroundTruth, names: Mapping[str, 
         if (image.width, image.height) != (view.width, view.height):
             raise InputError(
                 f"'{name}' has {image.width}x{image.height} pixels, its camera in '{truth.source}' ({truth.format}) is "
-                f"of {view.width}x{view.height}; evaluate images of that size"
+                f"of {view.width}x{view.height}; evaluate images of that size (`sgam-sfm compare --scene-scale` scales "
+                "images and truth alike)"
             )
 
 
@@ -269,13 +275,13 @@ def _seconds(pairs: Sequence[JudgedPair]) -> dict[str, float]:
 
 
 def _sliced(
-    results: Mapping[Pair, JudgedPair], facts: Mapping[Pair, TruePair], auc_degrees: Sequence[float]
+    results: Mapping[Pair, JudgedPair], facts: Mapping[Pair, TruePair], auc_degrees: Sequence[float], *, by_areas: bool
 ) -> list[dict[str, Any]]:
     slices = []
     for title, (value_of, parts) in _SLICES.items():
         for part in parts:
             chosen = [result for pair, result in results.items() if _belongs(value_of(facts[pair]), part)]
-            figures = figures_of(chosen, auc_degrees)
+            figures = figures_of(chosen, auc_degrees, by_areas=by_areas)
             slices.append({"by": title, "part": _title(part), "num_pairs": len(chosen), "figures": figures})
     return slices
 

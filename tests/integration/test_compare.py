@@ -74,6 +74,11 @@ def test_every_method_has_its_figures_and_its_price(compared):
     assert sgam["figures"]["megapixels_matched"]["mean"] > plain["figures"]["megapixels_matched"]["mean"]
     assert sgam["verdicts"]["points"] == "gain"
     assert set(plain["verdicts"].values()) <= {"tie", ""}
+    fallbacks = sum(sgam["runs"][0]["fallbacks"].values())
+    assert sgam["figures"]["pairs_by_areas"]["mean"] == pytest.approx(100 * (1 - fallbacks / 6))
+    assert plain["figures"]["pairs_by_areas"] is content["methods"][3]["figures"]["pairs_by_areas"] is None
+    assert content["options"]["crop"]["image_size"] == 480
+    assert plain["options"] == {"area_matcher": "none", "matcher": "xfeat-star"}
     spent = covisible["figures"]["megapixels_matched"]["mean"]
     assert covisible["cap"] or spent == pytest.approx(sgam["figures"]["megapixels_matched"]["mean"], rel=0.02)
 
@@ -178,6 +183,9 @@ def test_evaluate_judges_matches_poses_and_areas(folder, tmp_path):
     assert figures["SOA+SIA"]["areas_all"] >= max(figures["SOA"]["areas_all"], figures["SIA"]["areas_all"])
     assert figures["full"]["amp_after_gr"] >= figures["SOA+SIA"]["amp_all"]
     assert figures["whole images"]["aor_all"] is None
+    assert figures["whole images"]["fallbacks"] is None
+    assert figures["full"]["fallbacks"] is not None
+    assert content["options"]["crop"]["image_size"] == 480
     full = next(variant for variant in content["variants"] if variant["name"] == "full")
     for by in ("rotation, degrees", "overlap", "labels in both"):
         assert sum(part["num_pairs"] for part in full["slices"] if part["by"] == by) == 3
@@ -237,7 +245,7 @@ def test_evaluate_refuses_images_that_the_true_cameras_do_not_fit(folder, tmp_pa
     assert cli.run(["evaluate", *command, "--area-matcher", "none"]) == ERROR
     error = capsys.readouterr().err
     assert "'view02.jpg' has 320x240 pixels, its camera in" in error
-    assert "is of 640x480; evaluate images of that size" in error
+    assert "is of 640x480; evaluate images of that size (`sgam-sfm compare --scene-scale` scales" in error
 
 
 def test_an_unknown_data_set_is_told_with_the_nearest(folder, tmp_path, capsys):

@@ -14,7 +14,7 @@ MARKS = {"gain": "▲", "loss": "▼", "tie": "="}
 _GROUPS = (
     ("Poses against the truth", ("auc_0.5", "auc_1", "auc_3", "auc_5", "center_error", "rotation_error_deg")),
     ("Model", ("registered", "points", "observations", "images_per_track", "reprojection_error_px")),
-    ("Pairs", ("verified_pairs", "inliers", "inlier_ratio")),
+    ("Pairs", ("pairs_by_areas", "verified_pairs", "inliers", "inlier_ratio")),
     ("Price", ("megapixels_matched", "megapixels_extracted", "matching_seconds", "total_seconds", "peak_memory_mb")),
 )
 _PRICES = (
