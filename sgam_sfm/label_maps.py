@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int32
@@ -21,11 +20,11 @@ from sgam_sfm.colours import distinct_colour
 from sgam_sfm.external import WorkerCommand
 from sgam_sfm.files import replacing, write_json
 from sgam_sfm.images import ImageFile, read_label_map
-from sgam_sfm.label_set import LARGEST_ID, RECORD, Label, LabelSet, at_size_of, has_aspect, read_label_set
+from sgam_sfm.label_set import RECORD, Label, LabelSet, at_size_of, read_label_set
 from sgam_sfm.machine import find_device
 from sgam_sfm.options import MatchOptions, SegmentOptions
 from sgam_sfm.progress import Stages
-from sgam_sfm.segmenters.protocol import Segmenter
+from sgam_sfm.segmenters.protocol import Segmenter, fault_of
 
 _log = logging.getLogger(__name__)
 _PNG_END = b"IEND\xaeB`\x82"
@@ -174,18 +173,12 @@ def _facts(segmenter: Segmenter) -> dict[str, object]:
     return {name: getattr(segmenter, name) for name in names if hasattr(segmenter, name)}
 
 
-def _unusable(file: ImageFile, made: Any, segmenter: str) -> str:
+def _unusable(file: ImageFile, made: object, segmenter: str) -> str:
     """Why what a segmenter gave for an image is no label map of it; empty when it is one."""
     if isinstance(made, Exception):
         return str(made)
-    given = f"{made.dtype} {made.shape}" if isinstance(made, np.ndarray) else type(made).__name__
-    expected = f"expected integers ({file.height}, {file.width}), or another size of the same aspect"
-    if not isinstance(made, np.ndarray) or made.dtype.kind not in "iu" or not has_aspect(made, file):
-        return f"the segmenter {segmenter} gave {given} for '{file.name}'; {expected}"
-    if made.min() < 0 or made.max() > LARGEST_ID:
-        between = f"from {made.min()} to {made.max()}"
-        return f"the segmenter {segmenter} gave ids {between} for '{file.name}'; expected 0 (unknown) to {LARGEST_ID}"
-    return ""
+    fault = fault_of(made, file)
+    return f"the segmenter {segmenter} {fault}" if fault else ""
 
 
 def _write_label_map(path: Path, labels: Int32[np.ndarray, "H W"]) -> None:

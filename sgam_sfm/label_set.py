@@ -19,7 +19,6 @@ from sgam_core.errors import InputError, OptionError
 from sgam_sfm.images import ImageFile
 from sgam_sfm.nearest import did_you_mean
 
-_SAME_ASPECT = 0.02  # ScanNet: 1296x968 and 640x480
 LARGEST_ID = 65535  # label maps have 16 bits
 RECORD = "labels.json"
 _MERGED = re.compile(r"(-other)?(-merged)?$")  # COCO's sky is `sky-other` or `sky-other-merged`
@@ -132,10 +131,10 @@ def at_size_of(image: ImageFile, labels: np.ndarray) -> np.ndarray:
     return cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT)
 
 
-def has_aspect(labels: np.ndarray, image: ImageFile) -> bool:
-    """Whether a map has an image's aspect, up to the rounding of its sides and what data sets take for the same."""
+def has_aspect(labels: np.ndarray, image: ImageFile, tolerance: float = 0.0) -> bool:
+    """Whether a map has an image's aspect, up to the rounding of its sides and a share of the aspect."""
     if labels.ndim != 2 or not labels.size:
         return False
     rows, columns = labels.shape
     off = abs(rows * image.width - columns * image.height)
-    return off <= max(image.width, image.height, _SAME_ASPECT * columns * image.height)
+    return off <= max(image.width, image.height, tolerance * columns * image.height)

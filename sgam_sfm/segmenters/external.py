@@ -11,7 +11,8 @@ from pydantic import TypeAdapter, ValidationError
 from sgam_core.errors import SGAMError, StageError
 from sgam_sfm.external import Worker, WorkerCommand
 from sgam_sfm.images import ImageFile, read_image
-from sgam_sfm.label_set import LARGEST_ID, Label, LabelSet, has_aspect
+from sgam_sfm.label_set import Label, LabelSet
+from sgam_sfm.segmenters.protocol import fault_of
 
 
 class ExternalSegmenter:
@@ -49,15 +50,11 @@ class ExternalSegmenter:
         pixels = read_image(image)
 
         def read(arrays: list[np.ndarray]) -> Int32[np.ndarray, "h w"]:
-            if len(arrays) != 1 or arrays[0].dtype != np.int32 or not has_aspect(arrays[0], image):
+            if len(arrays) != 1 or arrays[0].dtype != np.int32:
                 given = ", ".join(f"{array.dtype} {array.shape}" for array in arrays) or "nothing"
-                raise self._worker.wrong(
-                    f"gave {given} for '{image.name}'; expected int32 ({image.height}, {image.width}), or smaller in "
-                    "the same aspect"
-                )
-            if arrays[0].min() < 0 or arrays[0].max() > LARGEST_ID:
-                between = f"from {arrays[0].min()} to {arrays[0].max()}"
-                raise self._worker.wrong(f"gave ids {between} for '{image.name}'; expected 0 (unknown) to {LARGEST_ID}")
+                raise self._worker.wrong(f"gave {given} for '{image.name}'; expected one label map, of int32")
+            if fault := fault_of(arrays[0], image):
+                raise self._worker.wrong(fault)
             return arrays[0]
 
         return self._worker.ask({"type": "segment"}, [pixels], read, 1)

@@ -14,6 +14,8 @@ from sgam_sfm.images import MAX_IMAGE_SIZE, ImageFile, read_label_map
 from sgam_sfm.label_set import Label, LabelSet, at_size_of, has_aspect, read_label_set
 from sgam_sfm.label_tables import APART, LabelTable, find_table
 
+_SAME_ASPECT = 0.02  # ScanNet has maps of 1296x968 for images of 640x480
+
 
 class LabelFolder:
     """Reads the labels of `sub/a.jpg` from `<folder>/sub/a.jpg.png` or `<folder>/sub/a.png`.
@@ -87,7 +89,7 @@ class LabelFolder:
                 f"{image.height}x{image.width} (height x width); export them again at the image's size, or pass "
                 "--resize-labels"
             )
-        if not has_aspect(labels, image):
+        if not has_aspect(labels, image, _SAME_ASPECT):
             raise InputError(
                 f"labels for '{image.name}' are {labels.shape[0]}x{labels.shape[1]} but the image is "
                 f"{image.height}x{image.width} (height x width), of another aspect; export them again, turned as the "

@@ -10,6 +10,7 @@ from jaxtyping import Int32, UInt8
 
 from sgam_core.errors import SGAMError
 from sgam_sfm.images import ImageFile, read_image
+from sgam_sfm.label_set import LARGEST_ID, has_aspect
 
 
 @runtime_checkable
@@ -25,6 +26,18 @@ class Segmenter(Protocol):
         shares add up to len(images).
         """
         ...
+
+
+def fault_of(made: object, image: ImageFile) -> str:
+    """What is wrong with a label map of an image, as "gave ...; expected ..."; empty when nothing is."""
+    if not isinstance(made, np.ndarray) or made.dtype.kind not in "iu" or not has_aspect(made, image):
+        given = f"{made.dtype} {made.shape}" if isinstance(made, np.ndarray) else type(made).__name__
+        expected = f"integers ({image.height}, {image.width}), or another size of the same aspect"
+        return f"gave {given} for '{image.name}'; expected {expected}"
+    if made.min() < 0 or made.max() > LARGEST_ID:
+        between = f"from {made.min()} to {made.max()}"
+        return f"gave ids {between} for '{image.name}'; expected 0 (unknown) to {LARGEST_ID}"
+    return ""
 
 
 def one_by_one(

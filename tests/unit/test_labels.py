@@ -87,3 +87,17 @@ def test_missing_folder(tmp_path):
     assert str(error.value) == (
         f"label folder '{tmp_path}/labels' does not exist; give the folder that holds the label maps"
     )
+
+
+@pytest.mark.parametrize(
+    ("shape", "fits"), [((968, 1296), True), ((240, 320), True), ((640, 480), False), ((480, 480), False)]
+)
+def test_maps_of_another_size_are_resized_where_they_have_the_aspect_of_their_image(tmp_path, shape, fits):
+    save(tmp_path, "a.png", np.ones(shape, np.uint8))
+    image = image_file("a.jpg", 640, 480)
+    ((_, labels),) = LabelFolder(tmp_path, resize=True).segment([image], lambda share: None)
+    if fits:
+        assert labels.shape == (480, 640)
+    else:
+        assert str(labels).startswith(f"labels for 'a.jpg' are {shape[0]}x{shape[1]} but the image is 480x640")
+        assert "of another aspect" in str(labels)
