@@ -223,7 +223,10 @@ def _array(data: h5py.Dataset) -> np.ndarray:
 
 def stored_files(output: Path) -> list[Path]:
     """The blocks of a run's output folder that are done, then those in work."""
-    return [path for suffix in (".h5", _BEGUN) for path in sorted((output / "pairs").glob(f"*{suffix}"))]
+    done = sorted((output / "pairs").glob("*.h5"))
+    begun = sorted((output / "pairs").glob(f"*{_BEGUN}"))
+    # Where a run was killed as it completed a block, there are both.
+    return [*done, *(path for path in begun if path.with_suffix(".h5") not in done)]
 
 
 def read_pairs_of(output: Path) -> Iterator[PairRecord]:

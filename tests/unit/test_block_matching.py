@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sgam_core import Matches, PairResult
+from sgam_core import Matches
 from sgam_core.errors import InputError
 from sgam_sfm.executors import Begin, MatchingJob
 from sgam_sfm.inputs import Inputs
@@ -21,6 +21,7 @@ from sgam_sfm.progress import Stages
 from sgam_sfm.runs import block_matching
 from sgam_sfm.runs.block_matching import match_blocks
 from sgam_sfm.runs.store import PairRecord, PairStore, stored_files
+from tests.pair_results import whole_images
 
 NAMES = "abcdefg"
 WORK = tuple(tuple((name, str(number)) for number in range(4)) for name in NAMES[:2])
@@ -53,17 +54,8 @@ def record(pair: Pair) -> PairRecord:
     if pair[1] == "1":
         return PairRecord(pair=pair, result=None, error="broken")
     points = np.random.default_rng(NAMES.index(pair[0]) * 10 + int(pair[1])).uniform(0, 99, (5, 2))
-    result = PairResult(
-        matches=Matches(points0=points, points1=points + 1, scores=np.ones(5)),
-        areas=(),
-        two_view=None,
-        coverage0=0,
-        coverage1=0,
-        whole_scale0=1,
-        whole_scale1=1,
-        fallback="none",
-        seconds={"point matching": 1.0},
-    )
+    matches = Matches(points0=points, points1=points + 1, scores=np.ones(5))
+    result = whole_images(matches, fallback="none", seconds={"point matching": 1.0})
     return PairRecord(pair=pair, result=result)
 
 

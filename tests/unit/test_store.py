@@ -15,7 +15,8 @@ import pytest
 
 from sgam_core import Area, AreaMatch, Box, Matches, PairResult, TwoViewModel
 from sgam_core.errors import InputError
-from sgam_sfm.runs.store import PairRecord, PairStore, read_outcomes, read_pair_outcomes
+from sgam_sfm.runs.store import PairRecord, PairStore, read_outcomes, read_pair_outcomes, stored_files
+from tests.pair_results import whole_images
 
 PAIRS = (("a.jpg", "b.jpg"), ("a.jpg", "c.jpg"))
 
@@ -26,16 +27,7 @@ def store(tmp_path) -> PairStore:
     matches = Matches(
         points0=rng.uniform(0, 99, (40, 2)), points1=rng.uniform(0, 99, (40, 2)), scores=rng.uniform(size=40)
     )
-    result = PairResult(
-        matches=matches,
-        areas=(),
-        two_view=None,
-        coverage0=0,
-        coverage1=0,
-        whole_scale0=1,
-        whole_scale1=1,
-        fallback="none",
-    )
+    result = whole_images(matches, fallback="none")
     store = PairStore(folder=tmp_path / "pairs", fingerprint="mark")
     store.write(0, [PairRecord(pair=PAIRS[0], result=result), PairRecord(pair=PAIRS[1], result=None, error="broken")])
     return store
@@ -206,3 +198,9 @@ def test_a_block_is_read_as_it_was_written(tmp_path):
     assert store.has(0)
     with pytest.raises(InputError, match="was made from other images, pairs or options"):
         PairStore(folder=store.folder, fingerprint="y").has(0)
+
+
+def test_a_block_that_was_completed_as_its_run_was_killed_counts_once(store):
+    store.write_begun(0, list(store.read(0)))
+    store.write_begun(1, list(store.read(0)))
+    assert [path.name for path in stored_files(store.folder.parent)] == ["00000.h5", "00001.begun"]
