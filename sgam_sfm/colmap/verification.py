@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-import threading
 import zlib  # noqa: F401  (before pycolmap, whose wheel carries a zlib of its own: loaded later, ours would mix the two)
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -17,6 +16,7 @@ from sgam_core.errors import OptionError
 from sgam_sfm.colmap.process import Progress, run, serve
 from sgam_sfm.colmap.reading import require_database
 from sgam_sfm.pairs import Pair
+from sgam_sfm.repeating import repeating
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -106,20 +106,14 @@ def _verify(job: dict[str, Any], send: Progress) -> dict[str, Any]:
 @contextmanager
 def _counting_rows(database_path: str, table: str, report: Callable[[int], None]) -> Iterator[None]:
     """Report the growing number of rows, twice a second; verification itself has no callback."""
-    finished = threading.Event()
+    address = f"{Path(database_path).resolve().as_uri()}?mode=ro"
+    with closing(sqlite3.connect(address, uri=True, check_same_thread=False)) as database:
 
-    def count() -> None:
-        with closing(sqlite3.connect(f"{Path(database_path).resolve().as_uri()}?mode=ro", uri=True)) as database:
-            while not finished.wait(0.5):
-                report(database.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+        def count() -> None:
+            report(database.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
 
-    thread = threading.Thread(target=count, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        finished.set()
-        thread.join()
+        with repeating(count, 0.5):
+            yield
 
 
 if __name__ == "__main__":

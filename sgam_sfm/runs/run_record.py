@@ -20,6 +20,7 @@ from filelock import FileLock, Timeout
 from sgam_core.errors import InputError, SGAMError
 from sgam_sfm.files import remove_partials, write_json
 from sgam_sfm.progress import StageProgress, Stages
+from sgam_sfm.repeating import repeating
 from sgam_sfm.runs import supervised
 
 _SECONDS_BETWEEN_WRITES = 1.0
@@ -86,7 +87,7 @@ def recording(output: Path, stages: Stages) -> Iterator[RunRecord | None]:
     stages.listen = heart.listen
     state, reason = "done", ""
     try:
-        with heart.beating():
+        with repeating(heart.beat, SECONDS_BETWEEN_BEATS):
             yield before
     except KeyboardInterrupt as error:
         state, reason = "stopped", f"stopped by {error}" if str(error) else "stopped by Ctrl-C"
@@ -130,22 +131,10 @@ class _Heart:
         if changed or time.monotonic() - self._written > _SECONDS_BETWEEN_WRITES:
             self._beat()
 
-    @contextmanager
-    def beating(self) -> Iterator[None]:
-        over = threading.Event()
-
-        def beat() -> None:
-            while not over.wait(SECONDS_BETWEEN_BEATS):
-                with suppress(OSError):  # the run's own files tell of a full disk
-                    self._beat()
-
-        thread = threading.Thread(target=beat, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            over.set()
-            thread.join()
+    def beat(self) -> None:
+        """Write a sign of life."""
+        with suppress(OSError):  # the run's own files tell of a full disk
+            self._beat()
 
     def _beat(self) -> None:
         with self._writing:
