@@ -150,12 +150,9 @@ class PairPoints:
 
     def _in_image(self, crop0: Crop, crop1: Crop, found: Matches) -> Matches:
         """Matches of two crops in image pixels, without those outside of the crops."""
-        inside = _inside(crop0, found.points0) & _inside(crop1, found.points1)
-        if not inside.all():
-            outside = (
-                f"{len(inside) - inside.sum()} of {len(inside)} matches of a crop lie outside of it, and are dropped"
-            )
-            self.notes += (outside,)
+        inside = crop0.contains(found.points0) & crop1.contains(found.points1)
+        if outside := int((~inside).sum()):
+            self.notes += (f"{outside} of {len(found)} matches of a crop lie outside of it, and are dropped",)
             found = found.select(inside)
         return Matches(
             points0=crop0.to_image(found.points0),
@@ -184,11 +181,6 @@ def _require_as_agreed(matcher: PointMatcher, crops: Sequence[tuple[Crop, Crop]]
             raise wrong(f"scores from {found.scores.min():.3g} to {found.scores.max():.3g}; expected [0, 1]")
         if not (np.minimum(found.sigmas0, found.sigmas1) > 0).all():
             raise wrong("sigmas that are not above 0")
-
-
-def _inside(crop: Crop, points: np.ndarray) -> np.ndarray:
-    inside: np.ndarray = np.all((points >= 0) & (points <= crop.size), axis=1)
-    return inside
 
 
 def _scaled_crop(image: Image, box: Box, scale: float) -> Crop:

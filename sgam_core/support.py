@@ -28,13 +28,18 @@ def supported(putative: PutativeAreas, matches: Matches, max_chance: float, min_
         inside0, inside1 = area.area0.box.contains(matches.points0), area.area1.box.contains(matches.points1)
         joined, leaving, arriving = int((inside0 & inside1).sum()), int(inside0.sum()), int(inside1.sum())
         chance = float(binom.sf(joined - 1, leaving, inside1.mean())) if joined else 1.0
+        reason = ""
         if chance > max_chance:
-            reason = f"{joined} of {leaving} whole-image matches in its first area end in its second one, no more than"
-            return chance, replace(area, state=AreaState.SKIPPED, reason=f"{reason} chance")
-        if joined < min_overlap * max(leaving, arriving):
-            reason = f"{joined} whole-image matches lie in both its areas, {leaving} in the first, {arriving} in the"
-            return chance, replace(area, state=AreaState.SKIPPED, reason=f"{reason} second: they overlap in part")
-        return chance, area
+            reason = (
+                f"{joined} of {leaving} whole-image matches in its first area end in its second one, no more than "
+                "chance"
+            )
+        elif joined < min_overlap * max(leaving, arriving):
+            reason = (
+                f"{joined} whole-image matches lie in both its areas, {leaving} in the first, {arriving} in the "
+                "second: they overlap in part"
+            )
+        return chance, replace(area, state=AreaState.SKIPPED, reason=reason) if reason else area
 
     confident = sorted((judged(area) for area in putative.confident), key=itemgetter(0))
     return replace(

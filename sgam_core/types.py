@@ -137,6 +137,11 @@ class Crop:
         size = self.size[::-1] if turns % 2 else self.size
         return replace(self, size=size, turns=(self.turns + turns) % 4)
 
+    def contains(self, points: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, " N"]:
+        """Which points (N, 2), in crop pixels, lie on the crop."""
+        inside: np.ndarray = np.all((points >= 0) & (points < self.size), axis=1)
+        return inside
+
     def to_image(self, points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
         """Crop pixels (N, 2) to image pixels."""
         affine = self.crop_from_image

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from importlib.metadata import EntryPoint, entry_points
+from types import ModuleType
 from typing import Any
 
 from sgam_core.errors import OptionError
@@ -42,7 +43,7 @@ def takes(kind: str, name: str, setting: str) -> bool:
     Raises: OptionError for an unknown name.
     """
     try:
-        return setting in inspect.signature(require(kind, name).load()).parameters
+        return setting in inspect.signature(_load(kind, name)).parameters
     except ModuleNotFoundError:  # `create` says which
         return True
 
@@ -58,7 +59,7 @@ def create(kind: str, name: str, **settings: Any) -> Any:
     entry = require(kind, name)
     _, colon, rest = name.partition(":")
     try:
-        factory = entry.load()
+        factory = _load(kind, name)
         taken = inspect.signature(factory).parameters
         if colon and "name" not in taken:
             raise OptionError(f"--{kind} '{name}': '{entry.name}' is one model; give --{kind} {entry.name}")
@@ -71,14 +72,21 @@ def create(kind: str, name: str, **settings: Any) -> Any:
                 f"--{kind} '{name}': its constructor needs '{unknown[0]}', which no option gives; let it have a default"
             )
         return factory(**{key: value for key, value in settings.items() if key in taken})
+    except ModuleNotFoundError as error:
+        raise OptionError(f"--{kind} '{name}' needs the package '{error.name}'; run `{install(entry)}`") from error
+
+
+def _load(kind: str, name: str) -> Any:
+    """What an entry point names. Raises: OptionError when its module does not have it."""
+    entry = require(kind, name)
+    try:
+        return entry.load()
     except AttributeError as error:
-        if hasattr(error.obj, "__file__") and error.name in entry.attr.split("."):
+        if isinstance(error.obj, ModuleType) and error.name in entry.attr.split("."):
             raise OptionError(
                 f"--{kind} '{name}': there is no '{entry.value}', as its package says ({error})"
             ) from error
-        raise
-    except ModuleNotFoundError as error:
-        raise OptionError(f"--{kind} '{name}' needs the package '{error.name}'; run `{install(entry)}`") from error
+        raise  # a fault of the module itself
 
 
 def install(entry: EntryPoint) -> str:

@@ -10,7 +10,7 @@ from sgam_core.types import Crop
 
 def wanted(crop: Crop, points: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, " N"]:
     """Which points (N, 2), in crop pixels, lie on the crop and where its mask is True."""
-    inside: np.ndarray = np.all((points >= 0) & (points < crop.size), axis=1)
+    inside = crop.contains(points)
     if (mask := crop.mask()) is not None:
         x, y = points[inside].astype(int).T
         inside[inside] = mask[y, x]
