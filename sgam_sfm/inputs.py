@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,9 +11,10 @@ from sgam_core.errors import InputError, OptionError
 from sgam_sfm.colmap.appending import require_no_descriptors
 from sgam_sfm.colmap.cameras import CameraInfo
 from sgam_sfm.colmap.image_import import CameraOptions, import_cameras
-from sgam_sfm.images import MAX_IMAGE_SIZE, ImageFile, image_format, inspect_image, list_images, printable
+from sgam_sfm.images import MAX_IMAGE_SIZE, ImageFile, image_format, inspect_image, list_images, printable, read_mask
+from sgam_sfm.nearest import listing
 from sgam_sfm.options import MatchOptions
-from sgam_sfm.pairs import PairList, all_pairs, read_pairs
+from sgam_sfm.pairs import PairList, all_pairs, read_pairs, require_pair_list
 from sgam_sfm.progress import Stages
 
 _log = logging.getLogger(__name__)
@@ -46,27 +47,24 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
 
     Raises: InputError when nothing is left to match; single images that cannot be used are set aside.
     """
-    for flag, folder in (("--mask-path", options.mask_path), ("--labels", options.labels)):
-        if folder is not None and not folder.is_dir():
-            raise InputError(f"{flag} '{folder}' does not exist; give the folder that holds <image name>.png")
-    found = read_images(options.images, options.output, stages, options.max_image_size)
+    if options.mask_path is not None and not options.mask_path.is_dir():
+        raise InputError(f"--mask-path '{options.mask_path}' does not exist; give the folder that holds <name>.png")
+    cameras = CameraOptions(
+        model=options.camera_model,
+        params=options.camera_params or None,
+        mode=options.camera_mode,
+        cameras=options.cameras,
+        rigs=options.rigs,
+        database=options.database,
+    )
+    if options.pairs is not None:
+        require_pair_list(options.pairs)
+    found = read_images(options.images, options.output, stages, options.max_image_size, options.mask_path)
     images, failed = found.images, found.failed
     num_listed = len(images) + len(failed)
     _check_any(images, failed, options.images)
     with stages.stage("Reading cameras", None):
-        imported = import_cameras(
-            options.output / "cameras.db",
-            options.images,
-            tuple(images),
-            CameraOptions(
-                model=options.camera_model,
-                params=options.camera_params or None,
-                mode=options.camera_mode,
-                cameras=options.cameras,
-                rigs=options.rigs,
-                database=options.database,
-            ),
-        )
+        imported = import_cameras(options.output / "cameras.db", options.images, tuple(images), cameras)
     for name, reason in imported.failures.items():
         failed[name] = f"'{name}' ({image_format(images[name].path)}): {reason}"
         del images[name]
@@ -89,6 +87,8 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
             f"no pair to match: {len(images)} of {num_listed} images in '{options.images}' can be used, and {why}"
         )
     used = {name for pair in pairs.pairs for name in pair}
+    if unused := sorted(images.keys() - used):
+        _log.warning("%d of %d images are in no pair, and get no pose: %s", len(unused), len(images), listing(unused))
     return Inputs(
         images={name: file for name, file in images.items() if name in used},
         cameras=imported.cameras,
@@ -108,25 +108,45 @@ class FoundImages:
     num_other_files: int
 
 
-def read_images(folder: Path, output: Path, stages: Stages, max_size: int = MAX_IMAGE_SIZE) -> FoundImages:
-    """Decode every image of a folder once.
+def read_images(
+    folder: Path, output: Path, stages: Stages, max_size: int = MAX_IMAGE_SIZE, mask_path: Path | None = None
+) -> FoundImages:
+    """Decode every image of a folder once, and its mask.
 
-    Args: max_size: in pixels; images with a longer side are not decoded, and count as failed.
-    Raises: OptionError when results would go into the folder; InputError when it holds no image.
+    Args: max_size: in pixels; images with a longer side are not decoded, and count as failed. mask_path: the folder of
+        masks; an image whose mask cannot be used counts as failed.
+    Raises: OptionError when results would go into the folder; InputError when it holds no image, or the other no mask.
     """
     refuse_among_images(output, folder)
     names, num_other_files = list_images(folder)
     images: dict[str, ImageFile] = {}
     failed: dict[str, str] = {}
+    without_mask: list[str] = []
     with stages.stage("Reading images", len(names)) as advance:
         for name in names:
             try:
-                images[name] = inspect_image(folder, name, max_size)
+                image = inspect_image(folder, name, max_size)
+                if mask_path is not None and read_mask(mask_path, image) is None:
+                    without_mask.append(name)
+                images[name] = image
             except InputError as error:
                 failed[printable(name)] = str(error)
                 _log.warning("%s", error)
             advance(1)
+    if mask_path is not None and without_mask:
+        _tell_of_masks(mask_path, without_mask, len(images))
     return FoundImages(images=images, failed=failed, num_other_files=num_other_files)
+
+
+def _tell_of_masks(mask_path: Path, without: Sequence[str], num_images: int) -> None:
+    """Say which images have no mask. Raises: InputError when none has one."""
+    name = next((name for name in without if (mask_path / name).with_suffix(".png").exists()), without[0])
+    named_otherwise = (mask_path / name).with_suffix(".png")
+    hint = f"; '{named_otherwise.name}' is there, and must be renamed" if named_otherwise.exists() else ""
+    expected = f"COLMAP's name for the mask of '{name}' is '{name}.png'{hint}"
+    if len(without) == num_images:
+        raise InputError(f"--mask-path '{mask_path}' holds no mask of the {num_images} images; {expected}")
+    _log.warning("%d of %d images have no mask in '%s': %s", len(without), num_images, mask_path, expected)
 
 
 def _check_existing(database: Path, images: Mapping[str, ImageFile], cameras: Mapping[str, CameraInfo]) -> None:

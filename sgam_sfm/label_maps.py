@@ -6,7 +6,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,11 +51,22 @@ class LabelMaps:
         )
 
 
-def make_label_maps(options: MatchOptions, images: Mapping[str, ImageFile], stages: Stages) -> LabelMaps:
-    """The label maps of a run in OUT/labels, at the size that areas are described at; made once."""
+def segmenter_of_run(options: MatchOptions) -> Segmenter | None:
+    """The segmenter that a run begins with, None when it has made its label maps already."""
+    made = (options.output / "labels" / RECORD).exists()
+    return None if made else create_segmenter(options, options.output / "cache")
+
+
+def make_label_maps(
+    options: MatchOptions, images: Mapping[str, ImageFile], stages: Stages, segmenter: Segmenter | None = None
+) -> LabelMaps:
+    """The label maps of a run in OUT/labels, at the size that areas are described at; made once.
+
+    Args: segmenter: of these options; where there is none, it is made when it is needed.
+    """
     folder = options.output / "labels"
     if not _are_whole(folder, images):
-        segmenter = create_segmenter(options, options.output / "cache")
+        segmenter = segmenter or create_segmenter(options, options.output / "cache")
         name = "labels" if options.labels else options.segmenter
         write_label_maps(segmenter, name, images, folder, stages, full_size=False)
     return LabelMaps(folder=folder, set=read_label_set(folder))
@@ -82,7 +93,8 @@ def _are_whole(folder: Path, images: Collection[str]) -> bool:
 def create_segmenter(options: MatchOptions | SegmentOptions, cache_folder: Path) -> Segmenter:
     """The segmenter of the options: a folder of maps when --labels is given.
 
-    Raises: SGAMError when it cannot be made, or OptionError when maps are described that are not given.
+    Raises: SGAMError when it cannot be made; OptionError when maps are described that are not given, or when a label is
+        named that it does not know, or when its labels have no names.
     """
     if options.label_names and not options.labels:
         raise OptionError(f"--label-names '{options.label_names}' says how --labels are written; give --labels too")
@@ -99,6 +111,10 @@ def create_segmenter(options: MatchOptions | SegmentOptions, cache_folder: Path)
         cache_folder=cache_folder,
         worker=WorkerCommand.of(options, "segmenter", options.segmenter),
     )
+    name = "labels" if options.labels else options.segmenter
+    known = replace(getattr(segmenter, "label_set", LabelSet()), segmenter=name)
+    for flag in ("ignore_labels", "mask_matches"):
+        known.require_names(getattr(options, flag, ""), f"--{flag.replace('_', '-')}")
     return segmenter
 
 

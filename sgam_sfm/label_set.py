@@ -76,6 +76,10 @@ class LabelSet:
         """
         return tuple(found for text in wanted.split(",") if text.strip() for found in self._ids(text.strip(), flag))
 
+    def require_names(self, wanted: str, flag: str) -> None:
+        """Raises: OptionError for a name that no label has; ids are not looked at, since maps may have more of them."""
+        self.ids(",".join(text for text in wanted.split(",") if not text.strip().isdecimal()), flag)
+
     def _ids(self, text: str, flag: str) -> Iterator[int]:
         by_name = self.by_name
         if text.lower() in by_name:

@@ -80,7 +80,7 @@ def localize(
     if not folder.is_dir():
         raise InputError(f"there is no model at {folder}; `sgam-sfm reconstruct OUT` makes one, or give --model DIR")
     model = read_model(folder)
-    with recording(options.output, stages := stages or Stages(quiet=True)):
+    with recording(options.output, stages := stages or Stages(quiet=True), "localize"):
         return _localize(options, results, model, stages, point_matcher)
 
 
@@ -118,6 +118,7 @@ def _localize(
         "localized": len(localized),
         "failed": failed,
         "references": len(inputs.images) - len(photos),
+        "reference_images": results.images,
         "pairs": len(inputs.pairs.pairs),
         "pairs_of_unusable_images": inputs.pairs.unreadable,
         "photos": {name: _told(query) for name, query in queries.items()},

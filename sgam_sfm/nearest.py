@@ -1,9 +1,9 @@
-"""The name that was probably meant, for messages."""
+"""Names in messages: the one that was probably meant, and the first of many."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 
@@ -11,6 +11,12 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """`did you mean 'x'? ` with the nearest of the known names; empty when none is near."""
     near = difflib.get_close_matches(name, list(known), n=1)
     return f"did you mean '{near[0]}'? " if near else ""
+
+
+def listing(names: Sequence[str], most: int = 8) -> str:
+    """The first names in quotes, and how many more there are."""
+    shown = ", ".join(f"'{name}'" for name in names[:most])
+    return shown + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def did_you_mean_run(folder: Path, otherwise: str) -> str:

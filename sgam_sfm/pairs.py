@@ -81,6 +81,11 @@ def read_pairs(path: Path, names: Sequence[str], unreadable: Collection[str] = (
     )
 
 
+def require_pair_list(path: Path) -> None:
+    """Raises: InputError when the file cannot be read, or does not begin as text."""
+    next(_lines(path), None)
+
+
 def write_pairs(path: Path, pairs: Iterable[Pair]) -> None:
     """Write a pair list that `read_pairs` reads back; a tab separates the names when either contains a space.
 

@@ -23,7 +23,7 @@ from sgam_sfm.runs.results import json_object, open_results
 from sgam_sfm.runs.run_record import recording
 from sgam_sfm.runs.runner import KNOWN_CAMERAS
 from sgam_sfm.runs.store import read_pairs_of, stored_files
-from sgam_sfm.runs.summary import summarise_keypoints, versions
+from sgam_sfm.runs.summary import summarise_keypoints, summarise_models, versions
 from sgam_sfm.stage_options import AggregateOptions, ReconstructOptions
 
 
@@ -34,7 +34,7 @@ def reconstruct(options: ReconstructOptions, stages: Stages | None = None) -> di
     Raises: SGAMError for what cannot be used.
     """
     source = source_of(options)
-    with recording(source.output, stages := stages or Stages(quiet=True)):
+    with recording(source.output, stages := stages or Stages(quiet=True), "reconstruct"):
         source.carry_over()
         if source.database != source.written:
             copy_database(source.database, source.written)
@@ -51,7 +51,7 @@ def aggregate(options: AggregateOptions, stages: Stages | None = None) -> dict[s
     Raises: SGAMError for what cannot be used.
     """
     source, folder = source_of(options), options.results
-    with recording(source.output, stages := stages or Stages(quiet=True)):
+    with recording(source.output, stages := stages or Stages(quiet=True), "aggregate"):
         source.carry_over()
         use_threads(options.threads)
         run = starting_options(folder / "options.json", None)
@@ -109,7 +109,7 @@ class Source:
         summary = json_object(self.output / "summary.json")
         if summary:
             pairs = summary.get("pairs", {}) | {"verified": content["verified"], "inliers": content["inliers"]}
-            names = ("models", "no_model", "keypoints")
+            names = ("models", "no_model", "without_pose", "keypoints")
             changed = {name: content[name] for name in names if name in content}
             write_json(self.output / "summary.json", summary | {"pairs": pairs} | changed)
 
@@ -200,8 +200,7 @@ def _verify_and_map(
         "pairs": verified.num_pairs,
         "verified": len(verified.inliers),
         "inliers": sum(verified.inliers.values()),
-        "models": [] if mapped is None else mapped.models,
-        "no_model": "mapping was not asked for (--no-mapping)" if mapped is None else mapped.reason,
+        **summarise_models(mapped, source.written),
         "seconds": stages.seconds,
         "peak_memory_mb": {
             "verification": verified.peak_memory_mb,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
@@ -22,17 +23,18 @@ def run(options: LocalizeOptions, console: Console) -> int:
     refuse_among_images(options.output, options.images)  # before the log is begun there
     with logging_to(options.output / "log.txt", console, verbose=options.verbose):
         content = localize(options, Stages(console=console))
-    _print(content, console)
+    for what, text in poses_told(content):
+        console.print(f"{what:<10} {text}", highlight=False, markup=False, soft_wrap=True)
     if not content["localized"]:
         return NO_MODEL
     return SOME_FAILED if content["failed"] else DONE
 
 
-def _print(content: dict[str, Any], console: Console) -> None:
+def poses_told(content: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The content of localize.json for a terminal: what a line is about, and its text."""
     total = content["localized"] + len(content["failed"])
     lines = [("poses", f"{content['localized']} of {total} photos, with {content['references']} references")]
     lines += [("failed", f"{name}: {reason}") for name, reason in list(content["failed"].items())[:_MAX_REASONS]]
     if len(content["failed"]) > _MAX_REASONS:
         lines.append(("", f"and {len(content['failed']) - _MAX_REASONS} more, in localize.json"))
-    for what, text in lines:
-        console.print(f"{what:<10} {text}", highlight=False, markup=False, soft_wrap=True)
+    return lines

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
 
+from sgam_sfm.commands.localize import poses_told
 from sgam_sfm.exit_codes import DONE
+from sgam_sfm.nearest import listing
 
 if TYPE_CHECKING:
     from sgam_sfm.runs.status import RunStatus
@@ -61,24 +64,36 @@ def _lines(status: RunStatus) -> list[tuple[str, str]]:
         lines += _reasons(status.failed_images)
         if status.labels:
             lines.append(("labels", f"{status.labels} maps"))
-        lines.append(
-            ("pairs", f"{status.pairs_done} of {status.pairs} matched and stored, {len(status.failed_pairs)} failed")
-        )
-        lines += _by_reason(status)
+        if status.pairs_done is not None:
+            told = f"{status.pairs_done} of {status.pairs} matched and stored, {len(status.failed_pairs)} failed"
+            lines.append(("pairs", told))
+            lines += _by_reason(status)
         if status.damaged:
             lines.append(("damaged", f"{', '.join(status.damaged)}: the next run matches these pairs again"))
         if status.fallbacks:
             told = ", ".join(f"{count} {reason}" for reason, count in status.fallbacks.items())
             lines.append(("fallbacks", told))
-    if status.summary:
-        for number, model in enumerate(status.summary["models"]):
-            text = f"{model['registered']} of {model['total']} images, {model['points']} points"
-            lines.append((f"model {number}", text))
-        if not status.summary["models"]:
-            lines.append(("model", status.summary["no_model"]))
+    if status.summary and run.command == "localize":
+        lines += poses_told(status.summary)
+    elif status.summary:
+        if status.pairs_done is None:
+            counted = f"{status.summary['pairs']} with matches, {status.summary['verified']} verified"
+            lines.append(("pairs", counted))
+        lines += _models(status.summary)
     if status.next:
         lines.append(("next", status.next))
     return lines
+
+
+def _models(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    models, without = summary["models"], summary.get("without_pose", ())
+    lines = [
+        (f"model {number}", f"{model['registered']} of {model['total']} images, {model['points']} points")
+        for number, model in enumerate(models)
+    ]
+    if not models:
+        return [("model", summary["no_model"])]
+    return lines + ([("no pose", listing(without))] if without else [])
 
 
 def _by_reason(status: RunStatus) -> list[tuple[str, str]]:

@@ -45,13 +45,13 @@ def compare(options: CompareOptions, console: Console) -> dict[str, Any]:
     common = replace(common, device=str(find_device(options.device, "--device")))
     for matcher in sorted({method.matcher for method in methods if method.matcher}):
         create_matcher(replace(common, matcher=matcher))  # what one lacks is said now, not after hours
+    truth = None if options.ground_truth is None else read_ground_truth(options.ground_truth)
     given = common
     stages = Stages(console=console)
     inputs = read_inputs(replace(common, output=options.output / "inputs"), stages)
     if str(cut):
         common = cut_collection(cut, common, inputs, cut_folder(options.output, cut), stages)
         inputs = read_inputs(replace(common, output=options.output / "inputs"), stages)
-    truth = None if options.ground_truth is None else read_ground_truth(options.ground_truth)
     pairs = spread_over(inputs.pairs.pairs, options.max_pairs)
     write_pairs(options.output / "pairs.txt", pairs)
     common = replace(common, pairs=options.output / "pairs.txt")

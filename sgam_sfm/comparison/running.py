@@ -28,6 +28,7 @@ from sgam_sfm.progress import Stages
 from sgam_sfm.runs.matching import CollectionMatcher, create_area_matcher
 from sgam_sfm.runs.run_record import recording
 from sgam_sfm.runs.runner import match_collection, reconstruct
+from sgam_sfm.runs.summary import summarise_models
 
 _log = logging.getLogger(__name__)
 
@@ -119,7 +120,7 @@ def _fitted(job: Job, inputs: Inputs, matcher: CachedMatcher) -> Budget:
 def _run_sift(job: Job, stages: Stages) -> dict[str, Any]:
     """COLMAP's own features and matches, then the same verification and mapping as for every other method."""
     options = job.options
-    with recording(options.output, stages):
+    with recording(options.output, stages, "compare"):
         inputs = read_inputs(options, stages)
         database = options.output / "database.db"
         write_database(database, options.output / "cameras.db", {}, {})
@@ -135,8 +136,7 @@ def _run_sift(job: Job, stages: Stages) -> dict[str, Any]:
                 "verified": len(verified.inliers),
                 "inliers": sum(verified.inliers.values()),
             },
-            "models": [] if mapped is None else mapped.models,
-            "no_model": "" if mapped is None else mapped.reason,
+            **summarise_models(mapped, database),
             "seconds": stages.seconds,
         }
         summary = write_json(options.output / "summary.json", summary)

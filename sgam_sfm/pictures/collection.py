@@ -51,7 +51,8 @@ class ImageEntry:
     """An image of the sheet.
 
     keypoints, verified: number of keypoints and of verified pairs, None when there is no database. model: the folder of
-    its model, empty when it has no pose, None when there is no model at all. error: why it could not be used.
+    its model, empty when it has no pose, None when there is no model at all. error: why it could not be used. no_pose:
+    why it has no pose, where that is known.
     """
 
     name: str
@@ -59,6 +60,7 @@ class ImageEntry:
     verified: int | None
     model: str | None
     error: str = ""
+    no_pose: str = ""
 
     @property
     def trouble(self) -> str:
@@ -107,7 +109,8 @@ def _facts(picture: CollectionPicture, num_shown: int) -> list[str]:
     failed = sum(bool(entry.error) for entry in entries)
     lines = [
         f"{len(entries)} images, {failed or 'none'} of them failed; {picture.num_listed} pairs listed, "
-        f"{picture.num_matched} matched, {picture.num_failed or 'none'} failed, {len(picture.inliers)} verified."
+        f"{picture.num_matched} matched, {picture.num_failed or 'none'} failed"
+        + ("." if all(entry.verified is None for entry in entries) else f", {len(picture.inliers)} verified.")
     ]
     models = sorted({entry.model for entry in entries if entry.model}, key=int)
     registered = {model: sum(entry.model == model for entry in entries) for model in models}
@@ -181,7 +184,7 @@ def _graph(picture: CollectionPicture, nodes: Sequence[int], labelled: Collectio
     edges = sorted(among, key=lambda item: (-item[1], item[0]))[:MAX_EDGES][::-1]  # the strongest last, on top
     lines = [f"{len(edges)} of {len(picture.inliers)} verified pairs are drawn" + _left_out(picture, among, edges)]
     if not edges:
-        lines = ["No verified pair."] if picture.inliers or not picture.missing else ["Nothing has been verified yet."]
+        lines = ["No verified pair."] if picture.inliers or not picture.missing else ["No pair has been verified."]
     corners, side = circle(len(nodes)), min(440 + 20 * len(nodes), 900)
     norm = LogNorm(MIN_INLIERS, max((count for _, count in edges), default=0) + MIN_INLIERS)
 
@@ -265,6 +268,6 @@ def _side(canvas: Canvas, place: Rect, picture: CollectionPicture, bar: Bar | No
 
 def _reason(entry: ImageEntry) -> str:
     if not entry.error:
-        return f"{entry.name}: {entry.verified or 0} verified pairs"
+        return f"{entry.name}: {entry.no_pose or f'{entry.verified or 0} verified pairs'}"
     # Messages of reading begin with the name, `image 'a.jpg' cannot ...`.
     return f"{entry.name}: {entry.error.removeprefix('image ').removeprefix(repr(entry.name)).lstrip(': ')}"

@@ -98,6 +98,7 @@ def collection_picture(results: Results) -> Figure:
             verified=None if counts is None else partners[name],
             model=registered.get(name, "") if models else None,
             error=results.failed.get(name, ""),
+            no_pose=results.failed_poses.get(name, ""),
         )
         for name in results.names
     ]
@@ -108,7 +109,8 @@ def collection_picture(results: Results) -> Figure:
         except InputError:
             return None
 
-    missing = [_NO_DATABASE.replace("COLMAP's inliers", "keypoints and verified pairs")] if counts is None else []
+    why = "`localize` makes no database" if results.references else "no database.db"
+    missing = [f"keypoints and verified pairs ({why})"] if counts is None else []
     missing += [] if models else ["registered images (no model in sparse)"]
     return draw_collection(
         CollectionPicture(

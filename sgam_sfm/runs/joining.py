@@ -74,7 +74,7 @@ def join(options: JoinOptions, stages: Stages | None = None) -> dict[str, Any]:
     work = blocks(parts[0].pairs, run.block_images)
     sources = _sources(parts, work)
     existing = stamp_of_existing(run)
-    with recording(run.output, stages := stages or Stages(quiet=True)):
+    with recording(run.output, stages := stages or Stages(quiet=True), "join"):
         use_threads(run.threads)
         inputs = read_inputs(run, stages)
         store = open_store(run, inputs)

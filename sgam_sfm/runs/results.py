@@ -26,25 +26,26 @@ from sgam_sfm.colmap.reading import (
 )
 from sgam_sfm.images import MAX_IMAGE_SIZE, printable, read_image, read_label_map
 from sgam_sfm.label_set import read_label_set
-from sgam_sfm.nearest import did_you_mean_run
+from sgam_sfm.nearest import did_you_mean_run, listing
 from sgam_sfm.pairs import Pair
 from sgam_sfm.runs.store import PairRecord, PairStore, read_pair_outcomes
-
-_MAX_NAMES = 8  # in a message
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Results:
     """What a run has written so far; arrays are read when they are asked for.
 
-    images: folder with the images. options: content of options.json. names: images of the collection, sorted, those
-    that failed too. failed: images that could not be used, and why. blocks: pairs that were worked on, as they are
-    stored, and the block of each. errors: those of them that failed, and why. listed: all pairs of the list that is
-    known of, matched or not.
+    images: folder with the images. references: folder with those that photos were localized by, None where none were.
+    failed_poses: photos without a pose, and why. options: content of options.json. names: images of the collection,
+    sorted, those that failed too. failed: images that could not be used, and why. blocks: pairs that were worked on, as
+    they are stored, and the block of each. errors: those of them that failed, and why. listed: all pairs of the list
+    that is known of, matched or not.
     """
 
     folder: Path
     images: Path
+    references: Path | None
+    failed_poses: Mapping[str, str]
     options: Mapping[str, Any]
     names: tuple[str, ...]
     failed: Mapping[str, str]
@@ -92,7 +93,7 @@ class Results:
             partners = self.partners(name0)
             raise InputError(
                 f"the pair '{name0}' - '{name1}' was not in the list of '{self.folder}'; "
-                + (f"'{name0}' was listed with {_listing(partners)}" if partners else f"'{name0}' is in no pair")
+                + (f"'{name0}' was listed with {listing(partners)}" if partners else f"'{name0}' is in no pair")
             )
         if not {pair, pair[::-1]} & self.blocks.keys():
             raise InputError(
@@ -120,9 +121,11 @@ class Results:
 
         Raises: InputError when it is no longer where it was.
         """
-        if not (self.images / name).is_file():
+        folders = (self.images, self.references or self.images)
+        path = next((folder / name for folder in folders if (folder / name).is_file()), None)
+        if path is None:
             raise InputError(f"image '{name}' is no longer in '{self.images}'; give its folder with --images DIR")
-        return read_image(self.images / name, self.max_image_size)
+        return read_image(path, self.max_image_size)
 
     def labels(self, name: str) -> Int32[np.ndarray, "h w"] | None:
         """The label map of an image, None when the run made none."""
@@ -198,6 +201,7 @@ def open_results(folder: Path, images: Path | None = None) -> Results:
             + ("; check --images" if images else ": if it was moved, give the new one with --images DIR")
         )
     inputs, summary = json_object(folder / "inputs.json"), json_object(folder / "summary.json")
+    localized = json_object(folder / "localize.json")
     failed = {**summary.get("images", {}).get("failed", {}), **inputs.get("failed", {})}
     stored = tuple(read_pair_outcomes(folder))
     blocks = {outcome.pair: outcome.block for outcome in stored}
@@ -209,6 +213,8 @@ def open_results(folder: Path, images: Path | None = None) -> Results:
     return Results(
         folder=folder,
         images=image_folder,
+        references=Path(localized["reference_images"]) if "reference_images" in localized else None,
+        failed_poses=localized.get("failed", {}),
         options=options,
         names=tuple(sorted(names)),
         failed=failed,
@@ -285,8 +291,3 @@ def json_object(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
-
-
-def _listing(names: tuple[str, ...]) -> str:
-    shown = ", ".join(f"'{name}'" for name in names[:_MAX_NAMES])
-    return shown + (f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else "")

@@ -35,11 +35,12 @@ State = Literal["running", "done", "stopped", "failed", "killed"]
 class RunRecord:
     """The state of a run.
 
-    state: `killed` is never written: it is what a record says that still claims to run when nobody holds its lock.
-    started: of this process; crashes: how often one before it, of the same run, was ended from outside. updated: the
-    heartbeat, at least every ten seconds while the process lives; times are UTC, ISO 8601. done of total (None: not
-    known): steps of the current stage. pair: what is being matched. eta_seconds, seconds_per_step: of the stage, None
-    when not known. counts: images, images_failed, pairs, pairs_done, pairs_failed, fallbacks. error: why it failed.
+    command: of sgam-sfm, such as `match`. state: `killed` is never written: it is what a record says that still claims
+    to run when nobody holds its lock. started: of this process; crashes: how often one before it, of the same run, was
+    ended from outside. updated: the heartbeat, at least every ten seconds while the process lives; times are UTC, ISO
+    8601. done of total (None: not known): steps of the current stage. pair: what is being matched. eta_seconds,
+    seconds_per_step: of the stage, None when not known. counts: images, images_failed, pairs, pairs_done, pairs_failed,
+    fallbacks. error: why it failed.
     """
 
     state: State
@@ -47,6 +48,7 @@ class RunRecord:
     host: str
     started: str
     updated: str
+    command: str = "match"
     crashes: int = 0
     stage: str = ""
     done: float = 0.0
@@ -59,8 +61,8 @@ class RunRecord:
 
 
 @contextmanager
-def recording(output: Path, stages: Stages) -> Iterator[RunRecord | None]:
-    """Keep OUT/progress.json up to date while a run lasts.
+def recording(output: Path, stages: Stages, command: str = "match") -> Iterator[RunRecord | None]:
+    """Keep OUT/progress.json up to date while a run of a command lasts.
 
     Yields: how the last run in OUT ended, None when there was none.
     Raises: InputError when another run is working in OUT.
@@ -83,7 +85,7 @@ def recording(output: Path, stages: Stages) -> Iterator[RunRecord | None]:
     before = _read(path)
     if before is not None and before.seconds_per_step is not None:
         stages.paces = {before.stage: before.seconds_per_step}
-    heart = _Heart(path, stages)
+    heart = _Heart(path, stages, command)
     stages.listen = heart.listen
     state, reason = "done", ""
     try:
@@ -110,7 +112,7 @@ def recording(output: Path, stages: Stages) -> Iterator[RunRecord | None]:
 class _Heart:
     """Writes the record when something has changed, at most once a second, and every few seconds when nothing has."""
 
-    def __init__(self, path: Path, stages: Stages) -> None:
+    def __init__(self, path: Path, stages: Stages, command: str) -> None:
         self._path, self._stages = path, stages
         now = _now()
         self.record = RunRecord(
@@ -119,6 +121,7 @@ class _Heart:
             host=socket.gethostname(),
             started=now,
             updated=now,
+            command=command,
             crashes=len(supervised.crashes()),
         )
         self._written = 0.0

@@ -17,7 +17,7 @@ from sgam_sfm.colmap.verification import VerificationOptions, VerificationSummar
 from sgam_sfm.executors import MatchingJob, open_executor
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import Inputs, read_inputs
-from sgam_sfm.label_maps import make_label_maps
+from sgam_sfm.label_maps import make_label_maps, segmenter_of_run
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import peak_memory_mb
 from sgam_sfm.options import MatchOptions, as_json, fingerprint
@@ -26,12 +26,19 @@ from sgam_sfm.progress import Stages
 from sgam_sfm.runs.assembly import build_models, merged_records, verify_pairs, write_for_hloc
 from sgam_sfm.runs.block_matching import count_outcomes, match_blocks
 from sgam_sfm.runs.differences import difference
-from sgam_sfm.runs.matching import create_area_matcher
+from sgam_sfm.runs.matching import create_area_matcher, special_labels
 from sgam_sfm.runs.results import json_object
 from sgam_sfm.runs.run_record import recording
 from sgam_sfm.runs.shards import Shard
 from sgam_sfm.runs.store import PairStore, stored_files
-from sgam_sfm.runs.summary import CountedPairs, summarise_images, summarise_keypoints, summarise_pairs, versions
+from sgam_sfm.runs.summary import (
+    CountedPairs,
+    summarise_images,
+    summarise_keypoints,
+    summarise_models,
+    summarise_pairs,
+    versions,
+)
 
 _log = logging.getLogger(__name__)
 _WITHOUT_EFFECT = frozenset({"output", "config", "threads", "verbose", "log_json", "accept_licence"})
@@ -62,6 +69,8 @@ def _match_collection(
     existing = stamp_of_existing(options)
     with open_executor(options, point_matcher) as executor:
         options = replace(options, device=executor.device)
+        segmenting = replace(options, device=executor.own_device)
+        segmenter = segmenter_of_run(segmenting) if needs_labels else None  # what it lacks is said before work begins
         inputs = read_inputs(options, stages)
         stages.counts.update(images=len(inputs.images), images_failed=len(inputs.failed), pairs=len(inputs.pairs.pairs))
         same = ended_well and same_options(options)
@@ -75,8 +84,9 @@ def _match_collection(
                 stages.console.print(told, soft_wrap=True)
             return summary
         (options.output / "summary.json").unlink(missing_ok=True)  # of a run that this one goes on from
-        segmenting = replace(options, device=executor.own_device)
-        labels = make_label_maps(segmenting, inputs.images, stages) if needs_labels else None
+        labels = make_label_maps(segmenting, inputs.images, stages, segmenter) if needs_labels else None
+        special_labels(options, labels)
+        del segmenter  # its memory is the matcher's from here on
         share = Shard.parse(options.shard).blocks(work) if options.shard else range(len(work))
         job = MatchingJob(options=options, inputs=inputs, labels=labels)
         steps = match_blocks(work, store, executor, job, stages, share)
@@ -135,8 +145,7 @@ def assemble(
         "pairs": summarise_pairs(inputs, counted, verified),
         "labels": _summarise_labels(job),
         "keypoints": keypoints,
-        "models": [] if mapped is None else mapped.models,
-        "no_model": "mapping was not asked for (--no-mapping)" if mapped is None else mapped.reason,
+        **summarise_models(mapped, output / "database.db"),
         "seconds": stages.seconds,
         **facts,
         "peak_memory_mb": {

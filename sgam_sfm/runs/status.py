@@ -14,16 +14,19 @@ from sgam_sfm.nearest import did_you_mean_run
 from sgam_sfm.runs.run_record import RunRecord, read_run_record
 from sgam_sfm.runs.store import read_outcomes, stored_files
 
+# What commands write of a run that is done; others than these write summary.json.
+_SUMMARIES = {"reconstruct": "reconstruct.json", "aggregate": "aggregate.json", "localize": "localize.json"}
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RunStatus:
     """The state of a run.
 
     images, pairs: how many there are to work on (None before that is known). failed_images, failed_pairs: and why.
-    labels: images that have a label map. pairs_done: matched, with and without areas. fallbacks: pairs matched without
-    areas, failures: pairs that failed, both by reason. damaged: files of pairs that are to be matched again. summary:
-    OUT/summary.json of a finished run. next: the command that goes on from here. heartbeat_seconds: since the last sign
-    of life.
+    labels: images that have a label map. pairs_done: matched, with and without areas, None where pairs are not matched
+    in OUT. fallbacks: pairs matched without areas, failures: pairs that failed, both by reason. damaged: files of pairs
+    that are to be matched again. summary: what a finished run's command has written of it. next: how to go on from
+    here. heartbeat_seconds: since the last sign of life.
     """
 
     run: RunRecord
@@ -31,7 +34,7 @@ class RunStatus:
     failed_images: dict[str, str]
     labels: int
     pairs: int | None
-    pairs_done: int
+    pairs_done: int | None
     failed_pairs: dict[str, str]
     failures: dict[str, int]
     fallbacks: dict[str, int]
@@ -71,22 +74,28 @@ def read_status(output: Path) -> RunStatus:
                 failed[" - ".join(outcome.pair)] = outcome.error
             elif outcome.fallback:
                 fallbacks[outcome.fallback.partition(":")[0]] += 1
-    options, ended = output / "options.json", run.state in ("running", "done")
+    elsewhere = run.command in ("reconstruct", "aggregate") and not (output / "pairs").exists()
     return RunStatus(
         run=run,
         images=len(inputs["images"]) if inputs else None,
         failed_images=inputs.get("failed", {}),
         labels=sum(1 for _ in (output / "labels").rglob("*.png")),
         pairs=len(inputs["pairs"]) + len(inputs.get("left_out", ())) if inputs else None,
-        pairs_done=done,
+        pairs_done=None if elsewhere else done,
         failed_pairs=failed,
         failures=dict(Counter(failed.values()).most_common()),
         damaged=tuple(damaged),
         heartbeat_seconds=(datetime.now(UTC) - datetime.fromisoformat(run.updated)).total_seconds(),
         fallbacks=dict(sorted(fallbacks.items())),
-        summary=_read_json(output / "summary.json") if run.state == "done" else None,
-        next=f"sgam-sfm match --config '{options}'" if options.exists() and not ended else "",
+        summary=_read_json(output / _SUMMARIES.get(run.command, "summary.json")) if run.state == "done" else None,
+        next="" if run.state in ("running", "done") else _how_to_go_on(run.command, output / "options.json"),
     )
+
+
+def _how_to_go_on(command: str, options: Path) -> str:
+    if command != "match":
+        return f"start the same `sgam-sfm {command}` again"
+    return f"sgam-sfm match --config '{options}'" if options.exists() else ""
 
 
 def _read_json(path: Path) -> dict[str, Any] | None:

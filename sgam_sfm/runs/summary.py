@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import distributions, version
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
+from sgam_sfm.colmap.mapping import MappingSummary
+from sgam_sfm.colmap.reading import read_camera_ids
 from sgam_sfm.colmap.verification import VerificationSummary
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.merging.keypoints import CollectionKeypoints
+from sgam_sfm.nearest import listing
 from sgam_sfm.runs.store import PairRecord
 
 _PACKAGES = ("sgam-sfm", "pycolmap", "torch", "kornia", "numpy", "numba", "opencv-python-headless", "onnxruntime")
@@ -109,6 +114,15 @@ def summarise_keypoints(merged: CollectionKeypoints) -> dict[str, Any]:
     }
 
 
+def summarise_models(mapped: MappingSummary | None, database: Path) -> dict[str, Any]:
+    """What mapping made (None: it was not asked for) of a database, and the images that it left without a pose."""
+    if mapped is None:
+        return {"models": [], "no_model": "mapping was not asked for (--no-mapping)", "without_pose": []}
+    posed = {name for model in mapped.models for name in model.images}
+    without = sorted(read_camera_ids(database).keys() - posed)
+    return {"models": mapped.models, "no_model": mapped.reason, "without_pose": without}
+
+
 def versions() -> dict[str, str]:
     """Versions of the packages that results depend on."""
     installed = {distribution.name for distribution in distributions()}
@@ -187,6 +201,8 @@ def _add_models(content: Mapping[str, Any], table: Table) -> None:
         )
     if not content["models"]:
         table.add_row("model", content["no_model"])
+    elif content.get("without_pose"):  # runs of earlier versions do not say
+        table.add_row("no pose", escape(listing(content["without_pose"])))
     table.add_row("time", _told_seconds(content))
 
 

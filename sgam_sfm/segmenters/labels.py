@@ -32,7 +32,7 @@ class LabelFolder:
 
     def __init__(self, folder: Path, resize: bool = False, label_names: str = "") -> None:
         if not folder.is_dir():
-            raise InputError(f"label folder '{folder}' does not exist; give the folder that holds the label maps")
+            raise InputError(f"--labels '{folder}' does not exist; give the folder that holds <image name>.png")
         self.folder, self.resize = folder, resize
         self._given = read_label_set(folder)
         self._table: LabelTable | None = None

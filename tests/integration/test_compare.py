@@ -9,8 +9,10 @@ from pathlib import Path
 import PIL.Image
 import pytest
 
+from sgam_core.errors import InputError
 from sgam_sfm import cli
 from sgam_sfm.exit_codes import DONE, ERROR, USAGE
+from sgam_sfm.images import read_image
 from sgam_sfm.scene import write_ground_truth
 from tests.room import Room, write_room
 
@@ -196,17 +198,21 @@ def test_evaluate_judges_matches_poses_and_areas(folder, tmp_path):
     assert {"area matching", "point matching", "GP", "GR", "GMC"} <= set(full["seconds"])
 
 
-def test_a_pair_that_cannot_be_matched_counts_as_failed(folder, tmp_path, capsys):
-    masks = tmp_path / "masks"
-    masks.mkdir()
+def test_a_pair_that_cannot_be_matched_counts_as_failed(folder, tmp_path, capsys, monkeypatch):
     names = sorted(path.name for path in (folder / "images").iterdir())
-    PIL.Image.new("L", (9, 9), 255).save(masks / f"{names[0]}.png")
-    arguments = [*common(folder, tmp_path / "out"), "--mask-path", str(masks), "--area-matcher", "covisible"]
+
+    def read(file):
+        if file.name == names[0]:
+            raise InputError(f"'{file.name}' has gone")
+        return read_image(file)
+
+    monkeypatch.setattr("sgam_sfm.runs.matching.read_image", read)
+    arguments = [*common(folder, tmp_path / "out"), "--area-matcher", "covisible"]
     assert cli.run(["evaluate", *arguments]) == DONE
     assert "3 pairs could not be matched and count as failed" in capsys.readouterr().err
     for variant in json.loads((tmp_path / "out" / "evaluate.json").read_text())["variants"]:
         failed = [pair for pair in variant["pairs"] if names[0] in pair["pair"]]
-        assert all(pair["error"].startswith(f"mask of '{names[0]}' is 9x9 but the image is") for pair in failed)
+        assert all(pair["error"] == f"'{names[0]}' has gone" for pair in failed)
         assert all(pair["pose_error_deg"] == 180 and pair["num_matches"] == 0 for pair in failed)
         assert sum(pair["pose_error_deg"] < 5 for pair in variant["pairs"]) >= 2
 

@@ -11,12 +11,15 @@ import numpy as np
 import PIL.Image
 import pycolmap
 import pytest
+from matplotlib.text import Text
 
 from sgam_sfm import MatchOptions, cli, match_collection
 from sgam_sfm.colmap.reading import read_poses_and_points
 from sgam_sfm.evaluation.ground_truth import camera_table
 from sgam_sfm.exit_codes import DONE, ERROR, NO_MODEL, SOME_FAILED, USAGE
+from sgam_sfm.pictures import collection_picture
 from sgam_sfm.room.rendering import View
+from sgam_sfm.runs.results import open_results
 from tests.arc import ARC, CAMERA, FOCAL, HEIGHT, WIDTH, ArcMatcher, view, write_arc
 
 NEW = {name: view(name, angle) for name, angle in (("new/x.png", 8.0), ("y.png", -17.0))}
@@ -67,6 +70,7 @@ def test_new_photos_find_their_poses(finished, photos, tmp_path):
     assert (content["localized"], content["references"], content["pairs"]) == (2, 6, 12)
     poses, _ = read_poses_and_points(output / "sparse/0")
     assert poses.keys() == ARC.keys() | NEW.keys()
+    assert cli.run(["show", str(output), "y.png", "a.png"]) == DONE  # of two folders
     table = camera_table.FORMAT.read(output / "poses.csv", None).views
     lines = [line.split(" ") for line in (output / "poses.txt").read_text().splitlines()]
     assert [line[0] for line in lines] == list(table) == sorted(NEW)
@@ -110,6 +114,14 @@ def test_listed_pairs_failures_and_an_unknown_focal_length(finished, photos, tmp
     )
     assert content["failed"]["away.png"].endswith("are needed (--min-inliers)")
     assert "2 of 5 photos, with 5 references" in capsys.readouterr().err
+    assert cli.run(["status", str(output)]) == DONE
+    status = capsys.readouterr().out
+    assert "poses      2 of 5 photos, with 5 references\n" in status
+    assert f"failed     away.png: {content['failed']['away.png']}\n" in status
+    sheet = collection_picture(open_results(output))
+    written = " ".join(text.get_text() for text in sheet.findobj(Text))
+    assert "keypoints and verified pairs (`localize` makes no database)" in written
+    assert f"away.png: {content['failed']['away.png']}" in written
     assert content["photos"]["y.png"]["references"] == 2
     focal = content["photos"]["y.png"]["camera"]["params"][0]  # COLMAP's guess was 1.2 * 640
     assert focal == pytest.approx(FOCAL, rel=0.05)

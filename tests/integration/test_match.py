@@ -159,6 +159,42 @@ def test_masked_ground_has_no_match(room, folder, tmp_path):
     assert points[:, 0].min() > 640 // 2 - 3  # keypoints are means of several points
 
 
+def test_masks_that_are_missing_named_otherwise_or_of_another_size_are_told_at_once(room, folder, tmp_path, capsys):
+    masks, output = tmp_path / "masks", tmp_path / "out"
+    masks.mkdir()
+    _, a, b, c, *_ = sorted(Path(name).stem for name in room.images)
+    PIL.Image.new("L", (640, 480), 255).save(masks / f"{a}.png")
+    given = arguments(folder, output, "--area-matcher", "none", "--no-mapping", "--mask-path", str(masks))
+    assert cli.run(given) == ERROR
+    error = capsys.readouterr().err
+    assert f"--mask-path '{masks}' holds no mask of the 6 images; COLMAP's name for the mask of '{a}.jpg' is" in error
+    assert f"'{a}.jpg.png'; '{a}.png' is there, and must be renamed" in error
+    shutil.copy(masks / f"{a}.png", masks / f"{b}.jpg.png")
+    PIL.Image.new("L", (48, 64), 255).save(masks / f"{c}.jpg.png")
+    assert cli.run(given) == SOME_FAILED
+    assert "4 of 5 images have no mask in" in " ".join(capsys.readouterr().err.split())
+    summary = summary_of(output)
+    assert summary["images"]["failed"].keys() == {f"{c}.jpg"}
+    assert f"mask of '{c}.jpg' is 64x48 but the image is 480x640" in summary["images"]["failed"][f"{c}.jpg"]
+    assert not summary["pairs"]["failed"]
+
+
+def test_images_that_get_no_pose_are_named(room, folder, tmp_path, capsys):
+    pairs, masks, output = tmp_path / "pairs.txt", tmp_path / "masks", tmp_path / "out"
+    a, b, c, d, e, f = sorted(room.images)
+    pairs.write_text(f"{a} {b}\n{b} {c}\n{a} {c}\n{c} {f}\n")
+    masks.mkdir()
+    PIL.Image.new("L", (640, 480)).save(masks / f"{f}.png")  # nothing is matched there
+    changes = ["--area-matcher", "none", "--mask-path", str(masks), "--pairs", str(pairs)]
+    assert cli.run(arguments(folder, output, *changes)) == DONE
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"2 of 6 images are in no pair, and get no pose: '{d}', '{e}'" in told
+    assert f"no pose '{d}', '{e}', '{f}'" in told
+    assert summary_of(output)["without_pose"] == [d, e, f]
+    assert cli.run(["status", str(output)]) == DONE
+    assert f"no pose    '{d}', '{e}', '{f}'\n" in capsys.readouterr().out
+
+
 ONE_LINE_ERRORS = {
     "no folder": (["--images", "{tmp}/nowhere"], "image folder '{tmp}/nowhere' does not exist; give the folder that"),
     "empty folder": (
@@ -175,6 +211,10 @@ ONE_LINE_ERRORS = {
     "masks": (["--mask-path", "{tmp}/masks"], "--mask-path '{tmp}/masks' does not exist"),
     "labels": (["--labels", "{tmp}/labels"], "--labels '{tmp}/labels' does not exist"),
     "config": (["--config", "{tmp}/c.toml"], "--config '{tmp}/c.toml' does not exist"),
+    "a label's name": (
+        ["--mask-matches", "sky"],
+        "--mask-matches 'sky': labels of 'coseg' have no names; give ids, or",
+    ),
 }
 
 
@@ -188,6 +228,7 @@ def test_wrong_input_is_one_line(folder, tmp_path, capsys, case):
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
     assert len(errors) == 1
     assert expected.format(tmp=tmp_path) in errors[0]
+    assert not (tmp_path / "out" / "cameras.db").exists()  # told before images are read
 
 
 @pytest.mark.parametrize(

@@ -211,7 +211,7 @@ def test_from_file_reads_a_database_a_matches_file_and_a_list(synthetic, tmp_pat
             USAGE,
             "--descriptors and --labels are two ways to compare images; give one of them",
         ),
-        ("retrieval", ["--labels", "nowhere"], ERROR, "label folder 'nowhere' does not exist; give the folder"),
+        ("retrieval", ["--labels", "nowhere"], ERROR, "--labels 'nowhere' does not exist; give the folder"),
         ("retrieval", ["--descriptors", "no.h5"], ERROR, "there is no file 'no.h5'; give an h5 file of hloc"),
         ("retrieval", ["--cache", "{images}/c"], USAGE, "--cache '{images}/c' lies in the image folder; choose one"),
         ("sequential", ["--overlap", "0"], USAGE, "--overlap is 0; expected at least 1"),

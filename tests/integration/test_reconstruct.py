@@ -70,7 +70,7 @@ def test_another_mapper_without_matching_again(folder, output, mapper):
     assert record(output / "reconstruct.json")["options"]["mapper"] == mapper
 
 
-def test_the_model_goes_to_another_folder_and_the_run_stays(output, tmp_path):
+def test_the_model_goes_to_another_folder_and_the_run_stays(output, tmp_path, capsys):
     model = tmp_path / "model"
     assert cli.run(["reconstruct", str(output), "--output", str(model), "--refine-intrinsics"]) == DONE
     assert not (output / "sparse").exists()
@@ -79,6 +79,11 @@ def test_the_model_goes_to_another_folder_and_the_run_stays(output, tmp_path):
     assert database_content(model / "database.db") == database_content(output / "database.db")
     (camera,) = read_model(model / "sparse/0").cameras.values()
     assert 0 < abs(camera.params[0] / camera.params[1] - 1) < 0.05  # refined
+    capsys.readouterr()
+    assert cli.run(["status", str(model)]) == DONE
+    status = capsys.readouterr().out
+    assert "pairs      15 with matches, 15 verified\nmodel 0    6 of 6 images, " in status
+    assert "matched and stored" not in status
     assert cli.run(["reconstruct", str(model)]) == DONE  # the folder serves as OUT
     (camera,) = read_model(model / "sparse/0").cameras.values()
     assert camera.params[0] == pytest.approx(FOCAL, abs=1e-9)

@@ -85,7 +85,7 @@ def test_missing_folder(tmp_path):
     with pytest.raises(InputError) as error:
         LabelFolder(tmp_path / "labels")
     assert str(error.value) == (
-        f"label folder '{tmp_path}/labels' does not exist; give the folder that holds the label maps"
+        f"--labels '{tmp_path}/labels' does not exist; give the folder that holds <image name>.png"
     )
 
 

@@ -353,9 +353,7 @@ class TestCollection:
     def test_a_run_without_a_database_says_so(self):
         entries = [self.entry(n, keypoints=None, verified=None, model=None) for n in range(2)]
         figure = draw_collection(self.picture(entries, {}, missing=("keypoints (no database.db)",)), self.thumbnail)
-        assert {"Nothing has been verified yet.", "Not in this picture: keypoints (no database.db)."} <= set(
-            texts(figure)
-        )
+        assert {"No pair has been verified.", "Not in this picture: keypoints (no database.db)."} <= set(texts(figure))
         rendered(figure)
 
 

@@ -260,7 +260,7 @@ class TestPicturesOfWhatThereIs:
 
     def test_a_collection(self, out):
         words = words_of(collection_picture(open_results(out)))
-        assert "5 images, 1 of them failed; 4 pairs listed, 2 matched, 1 failed, 0 verified." in words
+        assert "5 images, 1 of them failed; 4 pairs listed, 2 matched, 1 failed." in words
         missing = "keypoints and verified pairs (no database.db); registered images (no model in sparse)"
         assert f"Not in this picture: {missing}." in words
         assert "broken.jpg: cannot be decoded (not an image)" in words

@@ -14,6 +14,7 @@ from sgam_core.errors import InputError, StageError
 from sgam_sfm.progress import Stages, duration
 from sgam_sfm.runs import run_record
 from sgam_sfm.runs.run_record import read_run_record, recording
+from sgam_sfm.runs.status import read_status
 from sgam_sfm.runs.supervision import Terminated
 
 
@@ -61,6 +62,13 @@ def test_a_killed_run_is_told_from_a_running_one(tmp_path):
     assert json.loads((tmp_path / "progress.json").read_text())["state"] == "running"
     record = read_run_record(tmp_path)
     assert (record.state, record.stage, record.error) == ("killed", "Mapping", "it ended without a word: killed?")
+
+
+def test_a_stopped_run_goes_on_by_the_command_that_it_was(tmp_path):
+    with pytest.raises(KeyboardInterrupt), recording(tmp_path, Stages(quiet=True), "localize"):
+        raise KeyboardInterrupt
+    (tmp_path / "options.json").write_text("{}")
+    assert read_status(tmp_path).next == "start the same `sgam-sfm localize` again"
 
 
 def test_no_run(tmp_path):
