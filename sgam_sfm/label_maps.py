@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -14,14 +14,15 @@ from jaxtyping import Bool, Int32
 from PIL import Image as PillowImage
 
 from sgam_core import layout_labels
-from sgam_core.errors import InputError, OptionError
+from sgam_core.errors import InputError, OptionError, SGAMError, StageError
 from sgam_sfm import registry
 from sgam_sfm.colours import distinct_colour
 from sgam_sfm.external import WorkerCommand
-from sgam_sfm.files import replacing, write_json
+from sgam_sfm.files import disk_is_full, replacing, write_json
 from sgam_sfm.images import ImageFile, read_label_map
 from sgam_sfm.label_set import RECORD, Label, LabelSet, at_size_of, read_label_set
-from sgam_sfm.machine import find_device
+from sgam_sfm.logs import in_one_line
+from sgam_sfm.machine import find_device, out_of_memory
 from sgam_sfm.options import MatchOptions, SegmentOptions
 from sgam_sfm.progress import Stages
 from sgam_sfm.segmenters.protocol import Segmenter, fault_of
@@ -137,7 +138,7 @@ def write_label_maps(
     pixels: Counter[int] = Counter()
     usable: set[str] = set()
     with stages.stage("Segmenting images", len(images)) as advance:
-        for file, made in segmenter.segment(tuple(images.values()), advance):
+        for file, made in _segmented(segmenter, images, advance):
             if reason := _unusable(file, made, type(segmenter).__name__):
                 failed[file.name] = reason
                 _log.warning("%s", reason)
@@ -181,6 +182,23 @@ def write_label_maps(
     )
     write_json(folder / RECORD, asdict(found))
     return read_label_set(folder)
+
+
+def _segmented(
+    segmenter: Segmenter, images: Mapping[str, ImageFile], advance: Callable[[float], None]
+) -> Iterator[tuple[ImageFile, object]]:
+    """What a segmenter gives for each image. Raises: StageError for a fault in it, somebody's plugin or not."""
+    name = type(segmenter).__name__
+    try:
+        for given in segmenter.segment(tuple(images.values()), advance):
+            if not (isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], ImageFile)):
+                raise StageError(f"the segmenter {name} gave {type(given).__name__}; expected (image, label map)")
+            yield given
+    except Exception as error:
+        if isinstance(error, SGAMError) or disk_is_full(error) or out_of_memory(error):
+            raise
+        _log.info("the segmenter %s failed", name, exc_info=error)
+        raise StageError(f"the segmenter {name} failed: {in_one_line(error)}; the log has the traceback") from error
 
 
 def _facts(segmenter: Segmenter) -> dict[str, object]:

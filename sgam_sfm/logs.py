@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -57,6 +58,13 @@ def logging_to(path: Path | None, console: Console, *, verbose: bool, as_json: b
                 logger.removeHandler(handler)
         for handler in handlers:
             handler.close()
+
+
+def in_one_line(error: Exception) -> str:
+    """An exception that nobody foresaw, and where it was raised."""
+    raised = traceback.extract_tb(error.__traceback__)[-1]
+    message = (str(error).splitlines() or [""])[0]
+    return f"{type(error).__name__}: {message} ({Path(raised.filename).name}:{raised.lineno})"
 
 
 class _AsJSON(logging.Formatter):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
@@ -23,9 +24,10 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.logs import logging_to
 from sgam_sfm.match_cache import CachedMatcher
-from sgam_sfm.options import MatchOptions
+from sgam_sfm.options import MatchOptions, fingerprint
 from sgam_sfm.progress import Stages
 from sgam_sfm.runs.matching import CollectionMatcher, create_area_matcher
+from sgam_sfm.runs.results import json_object
 from sgam_sfm.runs.run_record import recording
 from sgam_sfm.runs.runner import match_collection, reconstruct
 from sgam_sfm.runs.summary import summarise_models
@@ -90,6 +92,7 @@ def _run_matcher(job: Job, stages: Stages) -> dict[str, Any]:
         budget = _fitted(job, inputs, matcher)
         options, cap = budget.options, budget.cap
         _log.info("%s: %d of %d pixels %s", job.method.name, budget.reached, budget.target, cap)
+    _forget_interrupted(options, inputs)
     matcher.start()
     matcher.reset()
     summary = match_collection(options, stages, matcher)
@@ -99,6 +102,14 @@ def _run_matcher(job: Job, stages: Stages) -> dict[str, Any]:
         "saved_seconds": matcher.saved,
         "cap": cap,
     }
+
+
+def _forget_interrupted(options: MatchOptions, inputs: Inputs) -> None:
+    """Match from the start what was interrupted: the point matcher's results are kept, with what they cost."""
+    begun = json_object(options.output / "options.json").get("fingerprint")
+    mark = fingerprint(options, images=inputs.digests, pairs=inputs.pairs.pairs, cameras=inputs.cameras)
+    if begun == mark and not (options.output / "result.json").exists():
+        shutil.rmtree(options.output / "pairs", ignore_errors=True)
 
 
 def _fitted(job: Job, inputs: Inputs, matcher: CachedMatcher) -> Budget:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import logging
-import traceback
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 from sgam_core import AreaMatcher, Image, PairResult, PointMatcher, WholeImages, match_described
@@ -19,6 +17,7 @@ from sgam_sfm.external import WorkerCommand
 from sgam_sfm.images import read_image, read_mask
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.label_maps import LabelMaps
+from sgam_sfm.logs import in_one_line
 from sgam_sfm.machine import out_of_memory
 from sgam_sfm.models import require_licence
 from sgam_sfm.options import MatchOptions
@@ -129,7 +128,7 @@ class CollectionMatcher:
             if "CUDA error" in str(error) or (self._faults == _MOST_FAULTS and not self._any_result):
                 raise  # nothing will work in this process any more, or nothing ever did
             _log.info("%s - %s failed", *pair, exc_info=error)
-            return failed_record(pair, f"{_told(error)}; the log has the traceback")
+            return failed_record(pair, f"{in_one_line(error)}; the log has the traceback")
         self._any_result = True
         return PairRecord(pair=pair, result=result)
 
@@ -182,10 +181,3 @@ class CollectionMatcher:
     def _describe(self, name: str) -> Any:
         labels = None if self._labels is None else self._labels.read(name)
         return self._area_matcher.describe(self.image(name), labels)
-
-
-def _told(error: Exception) -> str:
-    """An exception that nobody foresaw, and where it was raised, in one line."""
-    raised = traceback.extract_tb(error.__traceback__)[-1]
-    message = (str(error).splitlines() or [""])[0]
-    return f"{type(error).__name__}: {message} ({Path(raised.filename).name}:{raised.lineno})"

@@ -124,6 +124,19 @@ def test_other_options_of_mapping_make_the_model_anew_from_the_matches_that_are_
     assert made["times"]["matching_seconds"] == plain["times"]["matching_seconds"]
 
 
+def test_a_method_that_was_interrupted_is_charged_with_all_of_its_matches(folder, begun):
+    method = begun / "none_xfeat-star"
+    before = content_of(begun)["methods"]
+    (method / "result.json").unlink()
+    (method / "summary.json").unlink()
+    assert cli.run(["compare", *common(folder, begun), "--no-report", "--methods", *METHODS]) == DONE
+    for one, other in zip(before, content_of(begun)["methods"], strict=True):
+        assert one["figures"] == other["figures"]
+    matching = json.loads((method / "result.json").read_text())
+    assert matching["pixels_extracted"] > 0
+    assert matching["saved_seconds"] > 0  # which an earlier session has spent
+
+
 def test_figures_of_other_pairs_are_never_shown(folder, begun, capsys):
     fewer = ["compare", *common(folder, begun), "--no-report", "--max-pairs", "3", "--methods"]
     assert cli.run([*fewer, "none:xfeat-star"]) == USAGE

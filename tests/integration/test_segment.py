@@ -11,13 +11,13 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from sgam_core.errors import WeightsError
+from sgam_core.errors import StageError, WeightsError
 from sgam_sfm import cli, registry
 from sgam_sfm.colmap.reading import database_content
 from sgam_sfm.exit_codes import DONE, ERROR, SOME_FAILED, USAGE
 from sgam_sfm.images import read_label_map
 from sgam_sfm.inputs import read_images
-from sgam_sfm.label_maps import make_label_maps
+from sgam_sfm.label_maps import make_label_maps, write_label_maps
 from sgam_sfm.label_set import read_label_set
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.progress import Stages
@@ -101,6 +101,30 @@ def test_labels_of_another_size_fail_unless_they_may_be_resized(folder, tmp_path
     assert cli.run([*command, "--output", str(tmp_path / "b"), "--resize-labels"]) == DONE
     assert read_label_map(tmp_path / "b" / "view02.jpg.png").shape == (480, 640)
     capsys.readouterr()
+
+
+class Faulty:
+    """A segmenter of somebody else's."""
+
+    def __init__(self, *given: object) -> None:
+        self._given = given
+
+    def segment(self, images, advance):
+        yield from self._given
+        raise KeyError("wall")
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ((), r"the segmenter Faulty failed: KeyError: 'wall' \(test_segment.py:\d+\); the log has the traceback"),
+        ((np.ones((3, 4), np.int32),), r"the segmenter Faulty gave ndarray; expected \(image, label map\)"),
+    ],
+)
+def test_a_segmenter_that_fails_is_named(folder, tmp_path, given, expected):
+    images = read_images(folder / "images", tmp_path / "none", Stages(quiet=True)).images
+    with pytest.raises(StageError, match=expected):
+        write_label_maps(Faulty(*given), "faulty", images, tmp_path / "labels", Stages(quiet=True), full_size=False)
 
 
 def matching(folder: Path, output: Path, *more: str) -> list[str]:
