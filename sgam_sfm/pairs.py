@@ -7,6 +7,7 @@ import difflib
 import posixpath
 import re
 import unicodedata
+from array import array
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -17,6 +18,7 @@ import numpy as np
 from sgam_core.errors import InputError
 
 _MAX_LINE = 2**16  # characters: of two paths, even of comments
+_MAX_FAULTS = 5  # lines whose numbers are told
 _NO_TEXT = (
     "the pair list {} is not a text file; expected UTF-8 text with lines of the form 'a.jpg b.jpg' "
     "(`sgam-sfm pairs from-file` makes one of a COLMAP database or hloc's matches.h5)"
@@ -57,10 +59,16 @@ def read_pairs(path: Path, names: Sequence[str], unreadable: Collection[str] = (
     pairs: dict[Pair, None] = {}
     set_aside: dict[Pair, None] = {}
     num_repeated = num_reversed = num_self = 0
+    faults, fault = array("q"), ""
     for number, line in _lines(path):
         if (pairs or set_aside or num_self) and _is_match(line, known):
             continue
-        name0, name1 = pair = _pair(line, known, f"{path}, line {number}")
+        pair = _pair(line, known)
+        if pair is None:
+            faults.append(number)
+            fault = fault or _fault(line, known)
+            continue
+        name0, name1 = pair
         target = set_aside if broken.intersection(pair) else pairs
         if name0 == name1:
             num_self += 1
@@ -70,6 +78,10 @@ def read_pairs(path: Path, names: Sequence[str], unreadable: Collection[str] = (
             num_reversed += 1
         else:
             target[pair] = None
+    if faults:
+        others = ", ".join(map(str, faults[1 : 1 + _MAX_FAULTS])) + (", ..." if len(faults) > 1 + _MAX_FAULTS else "")
+        more = f" ({len(faults) - 1} more lines cannot be used: {others})" if others else ""
+        raise InputError(f"{path}, line {faults[0]}: {fault}{more}")
     if not pairs and not set_aside:
         raise InputError(f"{path} names no pair of two different images; expected lines of the form 'a.jpg b.jpg'")
     return PairList(
@@ -173,30 +185,52 @@ def _is_match(line: str, known: Collection[str]) -> bool:
     return len(fields) == 2 and all(field.isdecimal() and field not in known for field in fields)
 
 
-def _pair(line: str, known: Mapping[str, str], where: str) -> Pair:
-    fields = [field.strip() for field in line.split("\t") if field.strip()] if "\t" in line else line.split()
-    if len(fields) != 2:
-        raise InputError(
-            f"{where}: expected two image names but found {len(fields)}; separate names that contain spaces by a tab"
-        )
-    return _known_name(fields[0], known, where), _known_name(fields[1], known, where)
+def _fields(line: str) -> list[str]:
+    return [field.strip() for field in line.split("\t") if field.strip()] if "\t" in line else line.split()
 
 
-def _known_name(name: str, known: Mapping[str, str], where: str) -> str:
-    """The image that a list means by this name, separators and `.` folded."""
+def _pair(line: str, known: Mapping[str, str]) -> Pair | None:
+    """The two images that a line names, None when it does not."""
+    names = [_known_name(field, known) for field in _fields(line)]
+    return (names[0], names[1]) if len(names) == 2 and names[0] and names[1] else None
+
+
+def _known_name(name: str, known: Mapping[str, str]) -> str:
+    """The image that a list means by this name, separators and `.` folded; empty when there is none."""
     if name in known:
         return known[name]
-    slashes = name.replace("\\", "/")
-    for other in (PurePosixPath(name).as_posix(), PurePosixPath(slashes).as_posix()):
-        if other in known:
-            return known[other]
-    hint = _hint(name, known)
-    shown = re.sub(r"[\x00-\x1f\x7f]", "?", name if len(name) <= 120 else name[:117] + "...")
+    folded = (PurePosixPath(text).as_posix() for text in (name, name.replace("\\", "/")))
+    return next((known[other] for other in folded if other in known), "")
+
+
+def _fault(line: str, known: Mapping[str, str]) -> str:
+    """Why a line does not name two images, and what to do."""
+    fields = _fields(line)
+    wanted = [name.strip() for name in line.split(",")]
+    if len(wanted) > 1 and all(_known_name(name, known) for name in wanted[:2]):
+        return "the names are separated by a comma; expected a space or a tab: 'a.jpg b.jpg'"
+    if len(fields) == 3 and _is_number(fields[2]) and all(_known_name(name, known) for name in fields[:2]):
+        return f"'{fields[2]}' in a third column looks like a score; expected two image names alone"
+    if len(fields) != 2:
+        return f"expected two image names but found {len(fields)}; separate names that contain spaces by a tab"
+    name = next(field for field in fields if not _known_name(field, known))
+    slashes, hint = name.replace("\\", "/"), _hint(name, known)
     if slashes.startswith("/") or PureWindowsPath(name).is_absolute():
-        raise InputError(f"{where}: '{shown}' is an absolute path; names are relative to the image folder; {hint}")
+        return f"'{_shown(name)}' is an absolute path; names are relative to the image folder; {hint}"
     if posixpath.normpath(slashes).startswith("../"):
-        raise InputError(f"{where}: '{shown}' leads out of the image folder; names are relative to that folder; {hint}")
-    raise InputError(f"{where}: '{shown}' is not among the {len(known)} images; {hint}")
+        return f"'{_shown(name)}' leads out of the image folder; names are relative to that folder; {hint}"
+    return f"'{_shown(name)}' is not among the {len(known)} images; {hint}"
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return bool(np.isfinite(float(text)))
+    except ValueError:
+        return False
+
+
+def _shown(text: str) -> str:
+    return re.sub(r"[\x00-\x1f\x7f]", "?", text if len(text) <= 120 else text[:117] + "...")
 
 
 def _hint(name: str, known: Collection[str]) -> str:
@@ -209,5 +243,5 @@ def _hint(name: str, known: Collection[str]) -> str:
     # The folder is what a list most often leaves out.
     file = PurePosixPath(name.replace("\\", "/")).name
     homonyms = [other for other in names if PurePosixPath(other).name == file]
-    closest = homonyms or difflib.get_close_matches(name, names, n=1, cutoff=0.0)
-    return f"the closest name is '{closest[0]}'" if closest else "there are no images"
+    closest = homonyms or difflib.get_close_matches(name, names, n=1)
+    return f"the closest name is '{closest[0]}'" if closest else f"names are such as '{names[0]}'"

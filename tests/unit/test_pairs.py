@@ -69,6 +69,29 @@ def test_other_than_two_names_hints_at_tabs(pair_file, line, count):
     )
 
 
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        ("a.jpg,b.jpg", "the names are separated by a comma; expected a space or a tab: 'a.jpg b.jpg'"),
+        ("a.jpg, b.jpg, 0.8", "the names are separated by a comma; expected a space or a tab: 'a.jpg b.jpg'"),
+        ("a.jpg b.jpg 0.83", "'0.83' in a third column looks like a score; expected two image names alone"),
+        ("a.jpg frame_000123.png", "'frame_000123.png' is not among the 4 images; names are such as 'a.jpg'"),
+    ],
+)
+def test_what_is_wrong_with_a_line_is_told(pair_file, line, fault):
+    path = pair_file(f"a.jpg b.jpg\n{line}\n")
+    with pytest.raises(InputError) as error:
+        read_pairs(path, NAMES)
+    assert str(error.value) == f"{path}, line 2: {fault}"
+
+
+def test_all_lines_with_a_fault_are_told_of(pair_file):
+    path = pair_file("a.jpg x\na.jpg b.jpg\n" + "y b.jpg\n" * 7)
+    told = r", line 1: 'x' is not among .* \(7 more lines cannot be used: 3, 4, 5, 6, 7, \.\.\.\)$"
+    with pytest.raises(InputError, match=told):
+        read_pairs(path, NAMES)
+
+
 @pytest.mark.parametrize("content", ["", "# only a comment\n", "a.jpg a.jpg\n"])
 def test_list_without_pairs_is_refused(pair_file, content):
     path = pair_file(content)
@@ -143,12 +166,18 @@ def test_a_backslash_in_the_name_of_a_file_comes_first(pair_file):
     assert read_pairs(pair_file("a.jpg sub\\c.jpg\n"), names).pairs == (("a.jpg", "sub\\c.jpg"),)
 
 
-@pytest.mark.parametrize(("name", "shown"), [("x" * 5000, "x" * 117 + "..."), ("\x1b[31ma.jpg", "?[31ma.jpg")])
-def test_what_is_no_name_is_shown_in_short(pair_file, name, shown):
+@pytest.mark.parametrize(
+    ("name", "shown", "hint"),
+    [
+        ("x" * 5000, "x" * 117 + "...", "names are such as"),
+        ("\x1b[31ma.jpg", "?[31ma.jpg", "the closest name is"),
+    ],
+)
+def test_what_is_no_name_is_shown_in_short(pair_file, name, shown, hint):
     path = pair_file(f"a.jpg {name}\n")
     with pytest.raises(InputError) as error:
         read_pairs(path, ("a.jpg",))
-    assert str(error.value) == (f"{path}, line 1: '{shown}' is not among the 1 images; the closest name is 'a.jpg'")
+    assert str(error.value) == (f"{path}, line 1: '{shown}' is not among the 1 images; {hint} 'a.jpg'")
 
 
 def test_unicode_forms_are_different_names(pair_file):
