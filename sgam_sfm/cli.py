@@ -6,7 +6,7 @@ import argparse
 import errno
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import version
@@ -62,6 +62,12 @@ _REFUSALS = {
     errno.EPERM: "no permission; choose another folder or change its permissions",
     errno.ENOTDIR: "a file is in the place of a folder; choose another folder",
     errno.EEXIST: "a file is in the place of a folder; choose another folder",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+    errno.ELOOP: "its links lead in a circle; choose another folder",
+    **dict.fromkeys(
+        (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ESTALE, errno.ETIMEDOUT),
+        "the file system fails; check the disk or the network share, then start the same command again",
+    ),
 }
 
 
@@ -71,6 +77,7 @@ def run(arguments: Sequence[str]) -> int:
     if list(arguments) == ["--version"]:
         print(version("sgam-sfm"))
         return DONE
+    options: Any = None
     try:
         options = _parse(arguments)
         command = import_module(f"sgam_sfm.commands.{_COMMANDS[type(options)]}")
@@ -79,7 +86,7 @@ def run(arguments: Sequence[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except Exception as error:
-        message, code = _explained(error)
+        message, code = _explained(error, getattr(options, "output", None))
         console.print(f"[red]error:[/red] {escape(message)}", highlight=False, soft_wrap=True)
         return code
     except KeyboardInterrupt:
@@ -88,21 +95,50 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _parse(arguments: Sequence[str]) -> Any:
-    known = list(_COMMANDS.values())
-    if arguments and not arguments[0].startswith("-") and arguments[0] not in known:
-        hint = did_you_mean(arguments[0], known)
-        raise OptionError(f"command '{arguments[0]}' is unknown; {hint}known: {', '.join(known)}")
-    commands: Any = Annotated[MatchOptions, tyro.conf.subcommand("match", default=_defaults(arguments, MatchOptions))]
+    known = {name: options for options, name in _COMMANDS.items()}
+    if arguments and not arguments[0].startswith("-"):
+        return _parse_command(arguments[0], arguments[1:], known)
+    commands: Any = Annotated[MatchOptions, tyro.conf.subcommand("match", default=_defaults((), MatchOptions))]
     for options, name in _COMMANDS.items():
-        if options in _NEEDED:
-            commands |= Annotated[options, tyro.conf.subcommand(name, default=_defaults(arguments, options))]
-        elif options is not MatchOptions:
+        if options is not MatchOptions:
             commands |= Annotated[options, tyro.conf.subcommand(name)]
     return tyro.cli(
-        Annotated[commands, tyro.conf.OmitSubcommandPrefixes],
+        commands,
         prog="sgam-sfm",
         description="Semantic area-to-point matching (SGAM) for COLMAP.\n\n" + MEANINGS,
         args=arguments,
+    )
+
+
+_HELP = tyro.constructors.ConstructorRegistry()
+
+
+@_HELP.primitive_rule
+def _path_or_none(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
+    """`PATH` in the help, in place of `{None}|PATH`."""
+    if info.type != Path | None:
+        return None
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH",
+        instance_from_str=lambda texts: None if texts[0] == "None" else Path(texts[0]),
+        is_instance=lambda value: value is None or isinstance(value, Path),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _parse_command(name: str, arguments: Sequence[str], known: Mapping[str, type]) -> Any:
+    if name not in known:
+        raise OptionError(f"command '{name}' is unknown; {did_you_mean(name, known)}known: {', '.join(known)}")
+    options: Any = known[name]
+    default = _defaults(arguments, options) if issubclass(options, MatchOptions) else None
+    given = {} if default is None else {"default": default}
+    return tyro.cli(
+        Annotated[options, tyro.conf.OmitSubcommandPrefixes],
+        prog=f"sgam-sfm {name}",
+        args=arguments,
+        registry=_HELP,
+        **given,
     )
 
 
@@ -111,7 +147,7 @@ def _defaults(arguments: Sequence[str], command: type[MatchOptions]) -> Any:
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--config", type=Path)
     early.add_argument("--preset")
-    known, _ = early.parse_known_args(arguments if arguments[:1] == [_COMMANDS[command]] else [])
+    known, _ = early.parse_known_args(arguments)
     start = starting_options(known.config, known.preset)
     values: dict[str, Any] = {option.name: getattr(start, option.name) for option in fields(start)}
     needed = {"images": Path(), "output": Path()} | _NEEDED.get(command, {})
@@ -122,8 +158,11 @@ def _defaults(arguments: Sequence[str], command: type[MatchOptions]) -> Any:
     return made
 
 
-def _explained(error: Exception) -> tuple[str, int]:
-    """One line for an error that a user can mend, and its exit code; any other is a mistake of ours: its traceback."""
+def _explained(error: Exception, output: object) -> tuple[str, int]:
+    """One line for an error that a user can mend, and its exit code; any other is a mistake of ours: its traceback.
+
+    Args: output: where the command was to write, if it got so far.
+    """
     if disk_is_full(error):
         return "the disk is full; free some space, then start the same command again", ERROR
     if out_of_memory(error) and not isinstance(error, SGAMError):
@@ -135,4 +174,6 @@ def _explained(error: Exception) -> tuple[str, int]:
         return str(error), USAGE if isinstance(error, OptionError) else ERROR
     if isinstance(error, OSError) and error.errno in _REFUSALS:
         return f"'{error.filename}' cannot be written: {_REFUSALS[error.errno]}", ERROR
+    if isinstance(error, FileNotFoundError) and isinstance(output, Path) and not output.exists():
+        return f"'{output}' cannot be made ({error.strerror}: '{error.filename}'); choose another --output", ERROR
     raise error

@@ -109,6 +109,12 @@ def test_an_output_that_cannot_be_written_is_one_line(folder, tmp_path, capsys):
     assert "a file is in the place of a folder; choose another folder" in capsys.readouterr().err
 
 
+def test_an_output_that_cannot_be_made_is_one_line(folder, capsys):
+    assert cli.run(arguments(folder, Path("/proc/out"))) == ERROR
+    told = "error: '/proc/out' cannot be made (No such file or directory: '/proc/out'); choose another --output"
+    assert told in capsys.readouterr().err
+
+
 def test_a_folder_that_may_not_be_written_is_one_line(folder, small_disk, capsys):
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
     assert cli.run(arguments(folder, small_disk / "out")) == ERROR
