@@ -174,6 +174,7 @@ def _explained(error: Exception, output: object) -> tuple[str, int]:
         return str(error), USAGE if isinstance(error, OptionError) else ERROR
     if isinstance(error, OSError) and error.errno in _REFUSALS:
         return f"'{error.filename}' cannot be written: {_REFUSALS[error.errno]}", ERROR
-    if isinstance(error, FileNotFoundError) and isinstance(output, Path) and not output.exists():
+    ours = (output, *output.parents) if isinstance(output, Path) else ()
+    if isinstance(error, FileNotFoundError) and Path(str(error.filename)) in ours:
         return f"'{output}' cannot be made ({error.strerror}: '{error.filename}'); choose another --output", ERROR
     raise error

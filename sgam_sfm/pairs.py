@@ -243,5 +243,6 @@ def _hint(name: str, known: Collection[str]) -> str:
     # The folder is what a list most often leaves out.
     file = PurePosixPath(name.replace("\\", "/")).name
     homonyms = [other for other in names if PurePosixPath(other).name == file]
-    closest = homonyms or difflib.get_close_matches(name, names, n=1)
-    return f"the closest name is '{closest[0]}'" if closest else f"names are such as '{names[0]}'"
+    if closest := homonyms or difflib.get_close_matches(name, names, n=1):
+        return f"the closest name is '{closest[0]}'"
+    return f"names are such as '{names[0]}'" if names else "there are no images"
