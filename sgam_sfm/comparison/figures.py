@@ -24,6 +24,10 @@ class Figure:
     better: Literal["more", "less", ""] = ""
     digits: int = 0
 
+    def shown(self, value: float) -> float:
+        """A value as it is printed: what differs only beyond its digits is equal."""
+        return round(value, self.digits)
+
 
 FIGURES = (
     Figure(name="registered", title="registered", better="more"),
@@ -125,13 +129,14 @@ def over_seeds(runs: Sequence[Mapping[str, float | None]]) -> dict[str, Spread |
 
 
 def verdict(figure: Figure, one: Spread | None, other: Spread | None) -> Literal["gain", "loss", "tie", ""]:
-    """Whether a method's figure is better than the reference's; a tie within the spread of the seeds.
+    """Whether a method's figure is better than the reference's; a tie within the spread of the seeds, or as printed.
 
     Returns: empty where either has no figure, or none is better than another.
     """
     if one is None or other is None or not figure.better:
         return ""
     difference = (one.mean - other.mean) * (1 if figure.better == "more" else -1)
-    if abs(difference) <= (one.spread or 0.0) + (other.spread or 0.0):
+    same = figure.shown(one.mean) == figure.shown(other.mean)
+    if same or abs(difference) <= (one.spread or 0.0) + (other.spread or 0.0):
         return "tie"
     return "gain" if difference > 0 else "loss"

@@ -129,7 +129,7 @@ def _cell(figure: Figure, method: Mapping[str, Any], reference: Mapping[str, Any
     verdict = method["verdicts"].get(figure.name, "")
     if not verdict:
         return Cell(text, _times(value["mean"], base) if base else "")
-    return Cell(text, _signed(value["mean"] - base, figure.digits), verdict, MARKS[verdict])
+    return Cell(text, _signed(figure.shown(value["mean"]) - figure.shown(base), figure.digits), verdict, MARKS[verdict])
 
 
 def _reference(content: Mapping[str, Any]) -> Mapping[str, Any]:
