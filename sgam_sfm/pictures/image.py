@@ -11,22 +11,17 @@ import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from sgam_core.types import Area, AreaState, PairResult
 from sgam_sfm.colours import distinct_colour
 from sgam_sfm.pictures.canvas import (
     INNER,
     LENGTHS,
-    MARGIN,
-    MUTED,
     NEUTRAL,
     SHADE,
-    SMALL,
     Bar,
     Canvas,
     ImageView,
-    Rect,
     Section,
     Table,
     Tag,
@@ -35,15 +30,14 @@ from sgam_sfm.pictures.canvas import (
     evenly,
     header,
     heading,
-    rgb,
     row_of,
     stacked,
     table,
-    text_width,
 )
+from sgam_sfm.pictures.legend import label_legend
 from sgam_sfm.pictures.pair import DASHES
 
-MAX_BOXES, MAX_ROWS, MAX_DOTS, MAX_LABELS = 40, 20, 800, 12
+MAX_BOXES, MAX_ROWS, MAX_DOTS = 40, 20, 800
 MAX_LENGTH = 8
 """Images a track where the colours end."""
 
@@ -96,7 +90,7 @@ def draw_single_image(picture: ImagePicture) -> Figure:
             "Areas and keypoints" if picture.keypoints is not None else "Areas", _facts(picture, uses), _bar(picture)
         ),
         _panels(picture, uses),
-        _label_legend(picture),
+        label_legend([view], picture.label_names),
     ]
     if uses:
         sections += [heading("The areas in numbers"), table(_table(uses, picture.label_names))]
@@ -129,7 +123,7 @@ def _keypoint_fact(picture: ImagePicture) -> str:
 
 def _facts(picture: ImagePicture, uses: Sequence[AreaUse]) -> list[str]:
     hidden = len(uses) - MAX_BOXES
-    areas = f"{len(uses)} areas over all pairs, solid where one of their matches was kept" + (
+    areas = f"{len(uses)} areas (outlines) over all pairs, solid where one of their matches was kept" + (
         f"; {hidden} of them are not drawn." if hidden > 0 else "."
     )
     if picture.keypoints is None:
@@ -185,38 +179,6 @@ def _panels(picture: ImagePicture, uses: Sequence[AreaUse]) -> Section:
             axes.scatter(x1, y1, s=24, c=colours, edgecolors=SHADE, linewidths=0.6)
 
     return Section(rects[0].height + 8, draw)
-
-
-def _label_legend(picture: ImagePicture) -> Section:
-    """The colours of the labels that cover most of the image."""
-    labels = picture.view.labels
-    if labels is None:
-        return Section(0, lambda canvas, top: None)
-    ids, counts = np.unique(labels, return_counts=True)
-    order = [n for n in np.argsort(-counts, kind="stable").tolist() if ids[n] != 0]
-    items = [
-        (int(ids[n]), f"{picture.label_names.get(int(ids[n]), f'label {ids[n]}')}: {counts[n] / labels.size:.0%}")
-        for n in order[:MAX_LABELS]
-    ]
-    places, left, line = [], 0.0, 0
-    for label, text in items:
-        width = 24 + text_width(text, SMALL) + 22
-        if left + width > INNER:
-            left, line = 0.0, line + 1
-        places.append((left, line, label, text))
-        left += width
-    rest = f"; {len(order) - MAX_LABELS} smaller labels are not listed" if len(order) > MAX_LABELS else ""
-    void = float(np.mean(labels == 0))
-    note = f"{void:.0%} of the image has no label{rest}." if void >= 0.005 or rest else ""
-
-    def draw(canvas: Canvas, top: int) -> None:
-        axes = canvas.axes(Rect(MARGIN, top, INNER, 26 * (line + 1)), (0, INNER), (26 * (line + 1), 0))
-        for x, row, label, text in places:
-            axes.add_patch(Rectangle((x, 26 * row + 5), 16, 16, facecolor=rgb(distinct_colour(label))))
-            canvas.text(MARGIN + x + 24, top + 26 * row + 3, text, SMALL, MUTED)
-        canvas.text(MARGIN, top + 26 * (line + 1) + 3, note, SMALL, MUTED)
-
-    return Section(26 * (line + 1 + bool(note)) + 8, draw)
 
 
 def _table(uses: Sequence[AreaUse], names: Mapping[int, str]) -> Table:

@@ -48,6 +48,7 @@ from sgam_sfm.pictures.canvas import (
     table,
     text_width,
 )
+from sgam_sfm.pictures.legend import label_legend
 
 MAX_BOXES, MAX_ROWS, MAX_LINES, MAX_DOTS = 60, 20, 90, 500
 MAX_DISTANCE = 4.0
@@ -66,6 +67,7 @@ _LEGENDS = {
     AreaState.UNRESOLVED: "doubtful, unresolved (?)",
     AreaState.SKIPPED: "skipped (-)",
 }
+_GUIDED = "Guided areas are windows on the ground that a first round found in both images, whatever its labels."
 _MARKS = {AreaState.KEPT: "", AreaState.REJECTED: _CROSS, AreaState.UNRESOLVED: "?", AreaState.SKIPPED: "-"}
 
 
@@ -98,7 +100,7 @@ def draw_pair(picture: PairPicture) -> Figure:
     sections = [header(" - ".join(view.name for view in views), _facts(picture))]
     if result.areas or any(view.labels is not None for view in views):
         title = heading("Areas", _area_facts(result)) if result.areas else heading("Labels")
-        sections += [title, _areas(views, result)]
+        sections += [title, _areas(views, result), label_legend(views, picture.label_names)]
     sections += _matches(views, picture.matching)
     if picture.plain is not None:
         sections += _matches(views, picture.plain)
@@ -141,8 +143,11 @@ def _area_facts(result: PairResult) -> list[str]:
     line = states
     if predicted:
         line += f"; {predicted} of those kept were doubtful, and chosen by geometry (GP)"
+    kinds = Counter(area.area0.kind for area in result.areas)
+    line += f"; by kind: {', '.join(f'{count} {kind}' for kind, count in kinds.items())}"
     hidden = len(result.areas) - MAX_BOXES
-    return [f"{line}." + (f" {hidden} of {len(result.areas)} are not drawn." if hidden > 0 else "")]
+    told = [_GUIDED] if kinds["guided"] else []
+    return [f"{line}." + (f" {hidden} of {len(result.areas)} are not drawn." if hidden > 0 else ""), *told]
 
 
 def _areas(views: tuple[ImageView, ImageView], result: PairResult) -> Section:
@@ -175,7 +180,8 @@ def _legend(canvas: Canvas, top: int, result: PairResult) -> None:
         (_LEGENDS[state], DASHES[state]) for state in AreaState if any(area.state is state for area in result.areas)
     ]
     axes = canvas.axes(Rect(MARGIN, top, INNER, 24), (0, INNER), (24, 0))
-    left = 0.0
+    canvas.text(MARGIN, top, title := "Outlines are areas:" if states else "", SMALL, MUTED)
+    left = text_width(title, SMALL) + 20
     for text, dashes in states:
         axes.add_line(Line2D((left, left + 48), (12, 12), color=INK, linewidth=2, linestyle=line_style(dashes)))
         canvas.text(MARGIN + left + 58, top, text, SMALL, MUTED)
@@ -264,7 +270,7 @@ def _match_facts(matching: Matching, num_lines: int, num_dots: int) -> list[str]
 
 
 def _table(result: PairResult, names: Mapping[int, str]) -> Table:
-    widths = (74, 140, 170, 140, 180, 90, 110, 110)
+    widths = (64, 120, 120, 130, 140, 80, 100, 90)
     areas = result.areas[:MAX_ROWS]
     rest = Counter(area.state for area in result.areas[MAX_ROWS:])
     reason = WIDTH - 2 * MARGIN - sum(widths)
