@@ -17,12 +17,20 @@ AUC_DEGREES = (0.5, 1.0, 3.0, 5.0)
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Figure:
-    """One figure of a run. better: which way it improves; empty for a price or a fact. digits: after the point."""
+    """One figure of a run. better: which way it improves; empty for a price or a fact. digits: after the point.
+
+    title: with its unit; `{unit}` stands for that of the truth.
+    """
 
     name: str
     title: str
     better: Literal["more", "less", ""] = ""
     digits: int = 0
+
+    def titled(self, truth: Mapping[str, Any] | None) -> str:
+        """The title for a ground truth, as compare.json has it."""
+        unit = "unknown" if truth is None else truth["unit"]
+        return self.title.format(unit="units of the truth" if unit == "unknown" else unit)
 
     def shown(self, value: float) -> float:
         """A value as it is printed: what differs only beyond its digits is equal."""
@@ -30,9 +38,9 @@ class Figure:
 
 
 FIGURES = (
-    Figure(name="registered", title="registered", better="more"),
-    *(Figure(name=f"auc_{d:g}", title=f"AUC@{d:g}", better="more", digits=1) for d in AUC_DEGREES),
-    Figure(name="center_error", title="centre error", better="less", digits=4),
+    Figure(name="registered", title="registered images", better="more"),
+    *(Figure(name=f"auc_{d:g}", title=f"AUC@{d:g}\N{DEGREE SIGN}, %", better="more", digits=1) for d in AUC_DEGREES),
+    Figure(name="center_error", title="centre error, {unit}", better="less", digits=4),
     Figure(name="rotation_error_deg", title="rotation error, degrees", better="less", digits=3),
     Figure(name="points", title="points", better="more"),
     Figure(name="observations", title="observations", better="more"),
@@ -48,7 +56,7 @@ FIGURES = (
 TIMES = (
     Figure(name="matching_seconds", title="matching, s", better="less"),
     Figure(name="total_seconds", title="total, s", better="less"),
-    Figure(name="peak_memory_mb", title="peak MB", better="less"),
+    Figure(name="peak_memory_mb", title="peak memory, MB", better="less"),
 )
 """Figures that differ between two runs with one seed."""
 

@@ -507,8 +507,8 @@ class TestParts:
         content = compared[1]
         rows = {row.title: row for group in table.table_groups(content) for row in group.rows}
         assert rows["matching, s"].cells[0] == table.Cell("3", "0.75x")
-        assert rows["AUC@1"].cells[0] == table.Cell("80.0", "+5.0", "gain", "▲")
-        assert rows["AUC@1"].cells[3] == table.Cell("")
+        assert rows["AUC@1°, %"].cells[0] == table.Cell("80.0", "+5.0", "gain", "▲")
+        assert rows["AUC@1°, %"].cells[3] == table.Cell("")
         assert "inlier ratio" not in rows
         assert [card.is_reference for card in table.cards(content)] == [False, True, False, False]
         assert table.cards(content)[1].prices == (("pixels", "3 Mpx"), ("matching", "4 s"))

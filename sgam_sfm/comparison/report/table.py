@@ -113,7 +113,7 @@ def _row(figure: Figure, content: Mapping[str, Any]) -> Row:
     hint = {"more": "more is better", "less": "less is better", "": ""}[figure.better]
     reference = _reference(content)
     cells = tuple(_cell(figure, method, reference) for method in content["methods"])
-    return Row(figure.title, hint, cells)
+    return Row(figure.titled(content["collection"]["ground_truth"]), hint, cells)
 
 
 def _cell(figure: Figure, method: Mapping[str, Any], reference: Mapping[str, Any]) -> Cell:
