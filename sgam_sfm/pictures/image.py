@@ -13,6 +13,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from sgam_core.types import Area, AreaState, PairResult
+from sgam_core.wording import counted
 from sgam_sfm.colours import distinct_colour
 from sgam_sfm.pictures.canvas import (
     INNER,
@@ -79,8 +80,8 @@ def draw_single_image(picture: ImagePicture) -> Figure:
     """Draw an image: labels and areas at the left, keypoints at the right, the areas in a table."""
     view, uses = picture.view, area_uses(picture.results)
     lines = [
-        f"{view.size[0]} x {view.size[1]} pixels; {len(picture.results)} of {picture.num_listed} pairs matched; "
-        f"{_keypoint_fact(picture)}."
+        f"{view.size[0]} x {view.size[1]} pixels; "
+        f"{len(picture.results)} of {counted(picture.num_listed, 'pair')} matched; {_keypoint_fact(picture)}."
     ]
     if picture.missing:
         lines.append(f"Not in this picture: {'; '.join(picture.missing)}.")
@@ -115,22 +116,22 @@ def _keypoint_fact(picture: ImagePicture) -> str:
         return "no keypoints yet"
     count, lengths = len(picture.keypoints), picture.track_lengths
     if lengths is None:
-        return f"{count} keypoints"
+        return counted(count, "keypoint")
     seen = lengths[lengths > 0]
     mean = f", seen by {seen.mean():.1f} images on average" if len(seen) else ""
-    return f"{count} keypoints, {len(seen)} of them with a point in model {picture.model}{mean}"
+    return f"{counted(count, 'keypoint')}, {len(seen)} of them with a point in model {picture.model}{mean}"
 
 
 def _facts(picture: ImagePicture, uses: Sequence[AreaUse]) -> list[str]:
     hidden = len(uses) - MAX_BOXES
-    areas = f"{len(uses)} areas (outlines) over all pairs, solid where one of their matches was kept" + (
+    areas = f"{counted(len(uses), 'area')} (outlines) over all pairs, solid where one of their matches was kept" + (
         f"; {hidden} of them are not drawn." if hidden > 0 else "."
     )
     if picture.keypoints is None:
         return [areas]
     shown, count = min(MAX_DOTS, len(picture.keypoints)), len(picture.keypoints)
     rings = "; rings: those without a point" if picture.track_lengths is not None else ""
-    return [areas, f"Dots: {shown} of {count} keypoints{rings}."]
+    return [areas, f"Dots: {shown} of {counted(count, 'keypoint')}{rings}."]
 
 
 def _bar(picture: ImagePicture) -> Bar | None:
@@ -200,5 +201,5 @@ def _table(uses: Sequence[AreaUse], names: Mapping[int, str]) -> Table:
             for number, use in enumerate(uses[:MAX_ROWS])
         ],
         colours=[distinct_colour(number) for number in range(len(uses[:MAX_ROWS]))],
-        rest=f"{rest} more areas." if rest > 0 else "",
+        rest=f"{counted(rest, 'more area')}." if rest > 0 else "",
     )

@@ -17,6 +17,7 @@ from matplotlib.patheffects import withStroke
 
 from sgam_core.geometry import sampson_distance
 from sgam_core.types import AreaMatch, AreaState, PairResult, TwoViewModel
+from sgam_core.wording import counted
 from sgam_sfm.colmap.reading import MatchedPoints
 from sgam_sfm.colours import distinct_colour
 from sgam_sfm.pictures.canvas import (
@@ -116,11 +117,11 @@ def mark(area: AreaMatch, number: int) -> str:
 
 def _facts(picture: PairPicture) -> list[str]:
     result = picture.matching.result
-    lines = [f"No areas, {len(result.matches)} point matches."]
+    lines = [f"No areas, {counted(len(result.matches), 'point match')}."]
     if result.areas:
         lines = [
-            f"{len(result.areas)} area matches, {len(result.matches)} point matches; kept areas cover "
-            f"{result.coverage0:.0%} of the left image and {result.coverage1:.0%} of the right one."
+            f"{counted(len(result.areas), 'area match')}, {counted(len(result.matches), 'point match')}; "
+            f"kept areas cover {result.coverage0:.0%} of the left image and {result.coverage1:.0%} of the right one."
         ]
     if result.fallback:
         lines.append(f"Matched as whole images: {result.fallback}.")
@@ -253,20 +254,24 @@ def _match_facts(matching: Matching, num_lines: int, num_dots: int) -> list[str]
         distances = _distances(model, result.matches.points0, result.matches.points1)
         near = np.count_nonzero(distances <= 1) / count
         found = (
-            f"{count} point matches, {near:.0%} of them within 1 pixel of the pair's "
+            f"{counted(count, 'point match')}, {near:.0%} of them within 1 pixel of the pair's "
             f"{'essential' if model.calibrated else 'fundamental'} matrix (median {np.median(distances):.2f})"
         )
     else:
-        found = f"{count} point matches; no two-view geometry was found, so that their colour tells no distance"
+        found = (
+            f"{counted(count, 'point match')}; no two-view geometry was found, so that their colour tells no distance"
+        )
     if inliers is None:
         checked = "not verified by COLMAP"
     elif len(inliers[0]):
-        checked = f"{len(inliers[0])} inliers after COLMAP's verification"
+        checked = f"{counted(len(inliers[0]), 'inlier')} after COLMAP's verification"
     else:
         checked = "no inlier was left by COLMAP's verification"
     verified = inliers is not None and len(inliers[0]) > 0
-    lined = f"{num_lines} of {len(inliers[0])} inliers" if inliers is not None and verified else f"{num_lines} matches"
-    return [f"{found}; {checked}.", f"Dots: {num_dots} of {count} point matches. Lines: {lined}."]
+    lined = counted(num_lines, "match")
+    if inliers is not None and verified:
+        lined = f"{num_lines} of {counted(len(inliers[0]), 'inlier')}"
+    return [f"{found}; {checked}.", f"Dots: {num_dots} of {counted(count, 'point match')}. Lines: {lined}."]
 
 
 def _table(result: PairResult, names: Mapping[int, str]) -> Table:

@@ -326,7 +326,7 @@ class TestCollection:
         ends = [segment[[0, -1]] for segment in edges.get_segments()]
         np.testing.assert_allclose(ends, [places[[0, 1]], places[[1, 3]]], atol=1e-12)  # the strongest on top
         assert edges.get_linewidths()[1] > edges.get_linewidths()[0]
-        assert {"1  000.jpg", "10 keypoints", "1 pairs, model 0", "800  001.jpg - 003.jpg"} <= set(texts(figure))
+        assert {"1  000.jpg", "10 keypoints", "1 pair, model 0", "800  001.jpg - 003.jpg"} <= set(texts(figure))
 
     def test_troubles_are_marked_and_named(self):
         entries = [
@@ -339,9 +339,9 @@ class TestCollection:
             self.picture(entries, {}), lambda name: None if name == "003.jpg" else self.thumbnail(name)
         )
         assert len(panels(figure)) == 2
-        assert {"1 pairs, no pose", "failed", "no image", "1 pairs, model 1"} <= set(texts(figure))
+        assert {"1 pair, no pose", "failed", "no image", "1 pair, model 1"} <= set(texts(figure))
         assert {"002.jpg: cannot be decoded", "Failed or without a pose: 2", "No verified pair."} <= set(texts(figure))
-        assert "Model 0 has 1 images, model 1 has 1 images; images without a pose: 2." in texts(figure)
+        assert "Model 0 has 1 image, model 1 has 1 image; images without a pose: 2." in texts(figure)
         red = matplotlib.colors.to_rgba("#c62828")
         (nodes,) = drawn(figure, PathCollection)
         assert [tuple(colour) == red for colour in nodes.get_facecolors()] == [True] * 4  # none has a verified pair
@@ -357,7 +357,7 @@ class TestCollection:
         assert "60 thumbnails, evenly through the names; 140 are not drawn." in texts(figure)
         assert len(drawn(figure, PathCollection)[0].get_offsets()) == 200
         assert len(drawn(figure, LineCollection)[0].get_segments()) == 600
-        assert "600 of 19900 verified pairs are drawn; the 19300 weakest are left out." in texts(figure)
+        assert "600 of 19900 verified pairs drawn; the 19300 weakest are left out." in texts(figure)
 
     def test_very_large_collections_are_sampled_in_the_graph_too(self):
         entries = [self.entry(n) for n in range(1201)]
@@ -366,9 +366,7 @@ class TestCollection:
         assert len(drawn(figure, PathCollection)[0].get_offsets()) == 600
         drawn_pairs = len(drawn(figure, LineCollection)[0].get_segments())
         assert 0 < drawn_pairs < 600
-        words = (
-            f"{drawn_pairs} of 1199 verified pairs are drawn; {1199 - drawn_pairs} are of images that are not drawn."
-        )
+        words = f"{drawn_pairs} of 1199 verified pairs drawn; {1199 - drawn_pairs} are of images that are not drawn."
         assert words in texts(figure)
 
     def test_a_run_without_a_database_says_so(self):

@@ -276,7 +276,7 @@ class TestPage:
     def test_says_what_is_missing_and_bounded(self, page):
         assert "no model: no pair was verified" in page.text
         assert "its budget could not be met" in page.text
-        assert "2 pairs were matched as whole images: no geometry" in page.text
+        assert "2 pairs matched as whole images: no geometry" in page.text
         for sentence in Bounds().sentences():
             assert sentence in page.text
 

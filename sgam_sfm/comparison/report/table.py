@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from sgam_core.wording import counted
 from sgam_sfm.comparison.figures import FIGURES, TIMES, Figure
 
 MARKS = {"gain": "▲", "loss": "▼", "tie": "="}
@@ -104,8 +105,7 @@ def remarks(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         # Whole images are all that `none` matches.
         fallbacks = {} if method["name"].startswith("none:") else run["fallbacks"]
         for reason, count in fallbacks.items():
-            pairs = "pair was" if count == 1 else "pairs were"
-            found.append((method["name"], f"{count} {pairs} matched as whole images: {reason}"))
+            found.append((method["name"], f"{counted(count, 'pair')} matched as whole images: {reason}"))
     return found
 
 
