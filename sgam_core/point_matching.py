@@ -16,6 +16,7 @@ from sgam_core.options import CropOptions
 from sgam_core.prediction import Estimate, MatchedArea
 from sgam_core.protocols import PointMatcher
 from sgam_core.types import AreaMatch, AreaState, Box, Crop, Image, Matches, PutativeAreas, TwoViewModel
+from sgam_core.wording import counted
 
 
 class PairPoints:
@@ -122,7 +123,7 @@ class PairPoints:
         self.pixels_of_areas += spent
         waiting = sum(area.state is not AreaState.SKIPPED for area in planned) - len(rows)
         if waiting:
-            self.notes += (f"{waiting} area matches beyond the pixel budget (max_crop_pixels)",)
+            self.notes += (f"{counted(waiting, 'area match')} beyond the pixel budget (max_crop_pixels)",)
         return rows
 
     def _matched(self, area: AreaMatch, crops: tuple[Crop, Crop], found: Matches | None) -> MatchedArea:

@@ -11,6 +11,7 @@ from sgam_core.geometry import mean_residual, residuals
 from sgam_core.options import GeometryOptions, RejectionOptions
 from sgam_core.prediction import Estimate, MatchedArea
 from sgam_core.types import AreaState, Matches, TwoViewModel
+from sgam_core.wording import counted
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -52,12 +53,12 @@ def reject(
     judged_all = [verdicts.get(id(area), area) for area in areas]
     kept = [area for area in judged_all if area.area.state is AreaState.KEPT]
     if not kept and not fallback:
-        fallback = f"GR rejected all: {len(candidates)} area matches"
+        fallback = f"GR rejected all: {counted(len(candidates), 'area match')}"
     if not fallback:
         pool = _pool(kept, options.max_pooled)
         model = estimate(Matches.concatenate([pool, _best(whole, len(pool))])) or model
-    counted = tuple(_counted(area, model, geometry) for area in judged_all)
-    return Verdict(areas=counted, model=model, fallback=fallback)
+    areas = tuple(_counted(area, model, geometry) for area in judged_all)
+    return Verdict(areas=areas, model=model, fallback=fallback)
 
 
 def _consensus(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from sgam_core.types import AreaState
 from sgam_sfm.colmap.pose_errors import PoseErrors, compare_poses
 from sgam_sfm.files import write_json
 from sgam_sfm.options import MatchOptions
@@ -39,27 +41,38 @@ def run_demo(output: Path, device: str, threads: int, console: Console) -> tuple
     )
     summary = match_collection(options, stages)
     print_summary(summary, console)
-    for picture in draw_pictures(options, output / "pictures"):
-        console.print(f"picture    {picture}", highlight=False, soft_wrap=True)
+    told = [("picture", str(picture)) for picture in draw_pictures(options, output / "pictures")]
+    database, model = options.output / "database.db", options.output / "sparse" / "0"
+    told.append(("database", str(database)))
+    look = ["colmap", "gui", "--database_path", database, "--image_path", options.images]
     if summary["models"]:
-        errors = compare_poses(options.output / "sparse" / "0", scene / "ground_truth")
+        errors = compare_poses(model, scene / "ground_truth")
         summary["pose_errors"] = errors
         write_json(options.output / "summary.json", summary)
-        console.print(_truth(errors), highlight=False, soft_wrap=True)
+        told = [("truth", _truth(errors)), *told, ("model", str(model))]
+        look += ["--import_path", model]
+    image = min(path.name for path in options.images.iterdir())
+    told.append(("next", f"where COLMAP is installed, in three dimensions: {shlex.join(map(str, look))}"))
+    told.append(("", f"an image with its labels: {shlex.join(['sgam-sfm', 'show', str(options.output), image])}"))
+    for what, text in told:
+        console.print(f"{what:<10} {text}", highlight=False, soft_wrap=True, markup=False)
     return options, summary
 
 
 def _truth(errors: PoseErrors) -> str:
     return (
-        f"truth      camera centres off by {1000 * errors.median_center:.1f} mm, directions by "
+        f"camera centres off by {1000 * errors.median_center:.1f} mm, directions by "
         f"{errors.median_rotation_deg:.3f} degrees (medians of {errors.num_images} images, in a room of 6 m)"
     )
 
 
 def draw_pictures(options: MatchOptions, folder: Path) -> list[Path]:
-    """Pictures of the collection and of the pairs with most areas kept, no image twice where it can be helped."""
+    """Pictures of the collection and of the pairs with most areas kept, no image twice where it can be helped.
+
+    Pairs with areas of the labels come first: most pairs of the room agree as whole images, and have guided areas only.
+    """
     records = [record for record in read_pairs_of(options.output) if record.result is not None]
-    records.sort(key=lambda record: (-_kept(record), record.pair))
+    records.sort(key=lambda record: (-_kept(record, guided=False), -_kept(record, guided=True), record.pair))
     chosen: list[PairRecord] = []
     for again in (False, True):
         for record in records:
@@ -75,5 +88,6 @@ def draw_pictures(options: MatchOptions, folder: Path) -> list[Path]:
     return [folder / f"{name}.png" for name in figures]
 
 
-def _kept(record: PairRecord) -> int:
-    return 0 if record.result is None else sum(area.state == "kept" for area in record.result.areas)
+def _kept(record: PairRecord, *, guided: bool) -> int:
+    areas = () if record.result is None else record.result.areas
+    return sum(area.state is AreaState.KEPT and (area.area0.kind == "guided") is guided for area in areas)

@@ -17,6 +17,7 @@ import psutil
 
 from sgam_core import Matches
 from sgam_core.errors import SGAMError
+from sgam_core.wording import counted
 from sgam_sfm.machine import find_device
 from sgam_sfm.models import list_models
 from sgam_sfm.options import MatchOptions
@@ -49,7 +50,8 @@ def examine(folder: Path, device: str, *, self_test: bool = True) -> Iterator[Fi
     yield from _clashes()
     chosen = find_device(device, "--device")
     name = torch.cuda.get_device_name(chosen) if chosen.type == "cuda" else platform.processor() or platform.machine()
-    yield Finding(what="device", text=f"{chosen} ({name}), {torch.get_num_threads()} threads of {os.cpu_count()} cores")
+    threads = f"{counted(torch.get_num_threads(), 'thread')} of {counted(os.cpu_count() or 1, 'core')}"
+    yield Finding(what="device", text=f"{chosen} ({name}), {threads}")
     yield from _onnx(chosen.type)
     memory = psutil.virtual_memory()
     yield Finding(

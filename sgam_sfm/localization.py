@@ -18,6 +18,7 @@ import pycolmap
 from sgam_core import PointMatcher
 from sgam_core.errors import InputError
 from sgam_core.geometry import residuals
+from sgam_core.wording import counted
 from sgam_sfm.colmap.absolute_pose import (
     Correspondences,
     Landmarks,
@@ -276,9 +277,10 @@ def _locate(info: CameraInfo, records: list[PairRecord], found: Correspondences,
     if len(errors) == len(records):
         reason = errors[0]
     elif points < options.min_inliers:
-        reason = f"{matches} matches with {len(records)} references show {points} points of the model; {needed}"
+        tried = f"{counted(matches, 'match')} with {counted(len(records), 'reference')}"
+        reason = f"{tried} show {counted(points, 'point')} of the model; {needed}"
     elif agree < options.min_inliers:
-        reason = f"{agree} of {points} points of the model agree with one pose; {needed}"
+        reason = f"{agree} of {counted(points, 'point')} of the model agree with one pose; {needed}"
     return _Query(references=len(records), matches=matches, found=found, pose=None if reason else pose, reason=reason)
 
 

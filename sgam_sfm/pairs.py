@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import numpy as np
 
 from sgam_core.errors import InputError
+from sgam_core.wording import counted
 
 _MAX_LINE = 2**16  # characters: of two paths, even of comments
 _MAX_FAULTS = 5  # lines whose numbers are told
@@ -124,8 +125,9 @@ def all_pairs(names: Sequence[str], max_images: int = 60) -> tuple[Pair, ...]:
     if len(names) > max_images:
         count = len(names) * (len(names) - 1) // 2
         raise InputError(
-            f"{len(names)} images make {count} pairs; matching all of them is meant for at most {max_images} images: "
-            "choose those that overlap (`sgam-sfm pairs --help`), or name them in a file, and pass it with --pairs"
+            f"{counted(len(names), 'image')} make {counted(count, 'pair')}; matching all of them is meant for at most "
+            f"{counted(max_images, 'image')}: choose those that overlap (`sgam-sfm pairs --help`), or name them in a "
+            "file, and pass it with --pairs"
         )
     return tuple(combinations(names, 2))
 

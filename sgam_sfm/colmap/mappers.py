@@ -16,6 +16,7 @@ from typing import Any
 
 import pycolmap
 
+from sgam_core.wording import counted
 from sgam_sfm.colmap.mapping import MappingOptions, ModelSummary
 from sgam_sfm.colmap.process import Progress, serve
 from sgam_sfm.colmap.refinement import refine
@@ -63,7 +64,7 @@ def _map(job: dict[str, Any], send: Progress) -> dict[str, Any]:
 def _no_model(inliers: Sequence[int], total: int, options: MappingOptions) -> str:
     """Why there may be no model, and what to do. Args: inliers: of each verified pair. total: number of images."""
     if options.mapper == "triangulate":
-        return f"COLMAP triangulated no point with the known poses from {len(inliers)} verified pairs"
+        return f"COLMAP triangulated no point with the known poses from {counted(len(inliers), 'verified pair')}"
     if total < options.min_model_size:
         return f"COLMAP's models start at {options.min_model_size} images, and there are {total}; give more photos"
     strong = sum(count >= _MANY_INLIERS for count in inliers)
@@ -74,9 +75,9 @@ def _no_model(inliers: Sequence[int], total: int, options: MappingOptions) -> st
             "some from farther apart; where EXIF has no focal length, give --camera-params or --cameras"
         )
     return (
-        f"COLMAP found no model of at least {options.min_model_size} images from {len(inliers)} verified pairs, the "
-        f"best with {max(inliers, default=0)} inliers; try pairs that overlap more (`sgam-sfm show OUT` draws them), "
-        "a larger --image-size, or another --matcher"
+        f"COLMAP found no model of at least {options.min_model_size} images from "
+        f"{counted(len(inliers), 'verified pair')}, the best with {counted(max(inliers, default=0), 'inlier')}; "
+        "try pairs that overlap more (`sgam-sfm show OUT` draws them), a larger --image-size, or another --matcher"
     )
 
 

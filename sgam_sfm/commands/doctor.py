@@ -11,6 +11,8 @@ from rich.markup import escape
 from sgam_sfm.exit_codes import DONE, ERROR
 from sgam_sfm.logs import logging_to
 
+_BUSY = "Loading, compiling, testing; the first time takes a minute or two ..."
+
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorOptions:
@@ -21,18 +23,24 @@ class DoctorOptions:
     device: str = "auto"
     """auto, cpu, cuda, cuda:1, ..."""
     self_test: bool = True
-    """Run the whole path on two rendered images (about ten seconds)."""
+    """Run the whole path on two rendered images (about ten seconds; a minute or two the first time)."""
 
 
 def run(options: DoctorOptions, console: Console) -> int:
     """Print what was found; an error when something is wrong."""
-    from sgam_sfm.doctor import examine
-
     output = Console()
     healthy = True
     folder = next(path for path in (options.output, *options.output.absolute().parents) if path.is_dir())
     with logging_to(None, console, verbose=False):
-        for finding in examine(folder, options.device, self_test=options.self_test):
+        with console.status(_BUSY):
+            from sgam_sfm.doctor import examine
+        findings = examine(folder, options.device, self_test=options.self_test)
+        while True:
+            # Nothing is printed while the spinner turns: it would take standard output for its own.
+            with console.status(_BUSY):
+                finding = next(findings, None)
+            if finding is None:
+                break
             mark = {True: "[green]ok[/] ", False: "[red]bad[/]", None: "   "}[finding.good]
             output.print(f"{mark} {finding.what:<12} {escape(finding.text)}", highlight=False, soft_wrap=True)
             if finding.good is False:

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
+from sgam_core.wording import counted
 from sgam_sfm.evaluation.options import EvaluateOptions
 from sgam_sfm.exit_codes import DONE
 from sgam_sfm.logs import logging_to
@@ -53,7 +54,7 @@ def _print(content: Mapping[str, Any], console: Console) -> None:
         for name, (title, digits) in (auc | _SHOWN).items()
     ]
     names = [variant["name"] for variant in variants]
-    print_figures(f"{content['num_pairs']} pairs", names, rows, console)
+    print_figures(counted(content["num_pairs"], "pair"), names, rows, console)
     if not any(pair["by_depth"] for variant in variants for pair in variant["pairs"]):
         console.print(
             "MMA is by the symmetric epipolar distance: the truth has no depth for these pairs", soft_wrap=True
@@ -72,7 +73,7 @@ def _print(content: Mapping[str, Any], console: Console) -> None:
     failed = sum(bool(pair["error"]) for pair in variants[0]["pairs"])
     if failed:
         console.print(
-            f"{failed} pairs could not be matched and count as failed; evaluate.json says why", style="yellow"
+            f"{counted(failed, 'pair')} could not be matched, counted as failed; evaluate.json says why", style="yellow"
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rich.console import Console
 
+from sgam_core.wording import counted
 from sgam_sfm.exit_codes import DONE
 from sgam_sfm.stage_options import ExportOptions
 
@@ -22,7 +23,7 @@ def run(options: ExportOptions, console: Console) -> int:
     num_images = write_keypoints_text(options.output / "keypoints", each_keypoints(database))
     num_pairs = write_matches_text(options.output / "matches.txt", each_matches(database))
     lines = (
-        ("written", f"{num_images} keypoint files, {num_pairs} pairs in matches.txt"),
+        ("written", f"{counted(num_images, 'keypoint file')}, {counted(num_pairs, 'pair')} in matches.txt"),
         (
             "next",
             f"colmap feature_importer --database_path new.db --image_path {results.images} "

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
+from sgam_core.wording import counted
 from sgam_sfm.exit_codes import DONE, NO_MODEL, SOME_FAILED
 from sgam_sfm.logs import logging_to
 from sgam_sfm.stage_options import LocalizeOptions
@@ -33,7 +34,12 @@ def run(options: LocalizeOptions, console: Console) -> int:
 def poses_told(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The content of localize.json for a terminal: what a line is about, and its text."""
     total = content["localized"] + len(content["failed"])
-    lines = [("poses", f"{content['localized']} of {total} photos, with {content['references']} references")]
+    lines = [
+        (
+            "poses",
+            f"{content['localized']} of {counted(total, 'photo')}, with {counted(content['references'], 'reference')}",
+        )
+    ]
     lines += [("failed", f"{name}: {reason}") for name, reason in list(content["failed"].items())[:_MAX_REASONS]]
     if len(content["failed"]) > _MAX_REASONS:
         lines.append(("", f"and {len(content['failed']) - _MAX_REASONS} more, in localize.json"))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
+from sgam_core.wording import counted
 from sgam_sfm.exit_codes import DONE, SOME_FAILED
 from sgam_sfm.logs import logging_to
 from sgam_sfm.pair_lists.options import PairsOptions
@@ -32,20 +33,20 @@ def run(options: PairsOptions, console: Console) -> int:
     paired = {name for part in parts for name in part}
     alone = [name for name in made.names if name not in paired]
     count = len(made.names) * (len(made.names) - 1) // 2
-    tell("pairs", f"{len(made.pairs)} of {count} that {len(made.names)} images make, in {method.output}")
+    tell("pairs", f"{len(made.pairs)} of {count} that {counted(len(made.names), 'image')} can make, in {method.output}")
     if alone:
-        tell("warning", f"{len(alone)} images are in no pair and will have no pose: {_some(alone)}")
+        tell("warning", f"{counted(len(alone), 'image')} in no pair, and so without a pose: {_some(alone)}")
     if len(parts) > 1:
-        told = _some([f"{len(part)} images ({part[0]}, ...)" for part in parts])
+        told = _some([f"{counted(len(part), 'image')} ({part[0]}, ...)" for part in parts])
         tell(
             "warning",
             f"no pair joins these {len(parts)} groups: {told}; each becomes a model of its own. If they show one "
             "scene, give more pairs: a larger --num or --overlap, a lower --min-score, or --loop-closure",
         )
     else:
-        tell("graph", f"one part: pairs join {'all' if not alone else 'the other'} {len(paired)} images")
+        tell("graph", f"one part: pairs join {'all' if not alone else 'the other'} {counted(len(paired), 'image')}")
     if made.failed:
-        tell("failed", f"{len(made.failed)} images cannot be compared: {_some(list(made.failed))}")
+        tell("failed", f"{counted(len(made.failed), 'image')} that cannot be compared: {_some(list(made.failed))}")
     command = ["sgam-sfm", "match", "--images", method.images, "--pairs", method.output]
     command += ["--output", default_run(method.output)]
     tell("next", shlex.join(map(str, command)))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
+from sgam_core.wording import counted
 from sgam_sfm.commands.localize import poses_told
 from sgam_sfm.exit_codes import DONE
 from sgam_sfm.nearest import listing
@@ -53,7 +54,7 @@ def _lines(status: RunStatus) -> list[tuple[str, str]]:
     beat = f", last sign of life {duration(status.heartbeat_seconds)} ago" if running else ""
     lines = [("state", f"{state} (process {run.pid} on {run.host}{beat})" + (f": {run.error}" if run.error else ""))]
     if run.crashes:
-        lines.append(("crashes", f"ended from outside and started again {run.crashes} times (see log.txt)"))
+        lines.append(("crashes", f"ended from outside and started again {counted(run.crashes, 'time')} (see log.txt)"))
     if run.state != "done" and run.stage:
         amount = f" {run.done:.0f} of {run.total:.0f}" if run.total else ""
         eta = f", about {duration(run.eta_seconds)} left of this stage" if run.eta_seconds is not None else ""
@@ -63,7 +64,7 @@ def _lines(status: RunStatus) -> list[tuple[str, str]]:
         lines.append(("images", f"{status.images} used, {len(status.failed_images)} failed"))
         lines += _reasons(status.failed_images)
         if status.labels:
-            lines.append(("labels", f"{status.labels} maps"))
+            lines.append(("labels", counted(status.labels, "map")))
         if status.pairs_done is not None:
             told = f"{status.pairs_done} of {status.pairs} matched and stored, {len(status.failed_pairs)} failed"
             lines.append(("pairs", told))
@@ -77,8 +78,8 @@ def _lines(status: RunStatus) -> list[tuple[str, str]]:
         lines += poses_told(status.summary)
     elif status.summary:
         if status.pairs_done is None:
-            counted = f"{status.summary['pairs']} with matches, {status.summary['verified']} verified"
-            lines.append(("pairs", counted))
+            told = f"{status.summary['pairs']} with matches, {status.summary['verified']} verified"
+            lines.append(("pairs", told))
         lines += _models(status.summary)
     if status.next:
         lines.append(("next", status.next))
@@ -88,7 +89,10 @@ def _lines(status: RunStatus) -> list[tuple[str, str]]:
 def _models(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     models, without = summary["models"], summary.get("without_pose", ())
     lines = [
-        (f"model {number}", f"{model['registered']} of {model['total']} images, {model['points']} points")
+        (
+            f"model {number}",
+            f"{model['registered']} of {counted(model['total'], 'image')}, {counted(model['points'], 'point')}",
+        )
         for number, model in enumerate(models)
     ]
     if not models:

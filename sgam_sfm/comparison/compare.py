@@ -230,8 +230,8 @@ def _run_content(run: Mapping[str, Any]) -> dict[str, Any]:
 
 def print_table(content: Mapping[str, Any], console: Console) -> None:
     """Figures down, methods across; green for a gain over the reference, red for a loss, nothing for a tie."""
-    methods = content["methods"]
-    rows = [(figure.title, [_cell(figure, method) for method in methods]) for figure in (*FIGURES, *TIMES)]
+    methods, truth = content["methods"], content["collection"]["ground_truth"]
+    rows = [(figure.titled(truth), [_cell(figure, method) for method in methods]) for figure in (*FIGURES, *TIMES)]
     hard = content["collection"]["hard"]
     title = f"against {content['reference']}{f', {hard}' if hard else ''}"
     print_figures(title, [method["name"] for method in methods], rows, console)

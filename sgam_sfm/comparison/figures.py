@@ -17,18 +17,30 @@ AUC_DEGREES = (0.5, 1.0, 3.0, 5.0)
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Figure:
-    """One figure of a run. better: which way it improves; empty for a price or a fact. digits: after the point."""
+    """One figure of a run. better: which way it improves; empty for a price or a fact. digits: after the point.
+
+    title: with its unit; `{unit}` stands for that of the truth.
+    """
 
     name: str
     title: str
     better: Literal["more", "less", ""] = ""
     digits: int = 0
 
+    def titled(self, truth: Mapping[str, Any] | None) -> str:
+        """The title for a ground truth, as compare.json has it."""
+        unit = "unknown" if truth is None else truth["unit"]
+        return self.title.format(unit="units of the truth" if unit == "unknown" else unit)
+
+    def shown(self, value: float) -> float:
+        """A value as it is printed: what differs only beyond its digits is equal."""
+        return round(value, self.digits)
+
 
 FIGURES = (
-    Figure(name="registered", title="registered", better="more"),
-    *(Figure(name=f"auc_{d:g}", title=f"AUC@{d:g}", better="more", digits=1) for d in AUC_DEGREES),
-    Figure(name="center_error", title="centre error", better="less", digits=4),
+    Figure(name="registered", title="registered images", better="more"),
+    *(Figure(name=f"auc_{d:g}", title=f"AUC@{d:g}\N{DEGREE SIGN}, %", better="more", digits=1) for d in AUC_DEGREES),
+    Figure(name="center_error", title="centre error, {unit}", better="less", digits=4),
     Figure(name="rotation_error_deg", title="rotation error, degrees", better="less", digits=3),
     Figure(name="points", title="points", better="more"),
     Figure(name="observations", title="observations", better="more"),
@@ -44,7 +56,7 @@ FIGURES = (
 TIMES = (
     Figure(name="matching_seconds", title="matching, s", better="less"),
     Figure(name="total_seconds", title="total, s", better="less"),
-    Figure(name="peak_memory_mb", title="peak MB", better="less"),
+    Figure(name="peak_memory_mb", title="peak memory, MB", better="less"),
 )
 """Figures that differ between two runs with one seed."""
 
@@ -125,13 +137,14 @@ def over_seeds(runs: Sequence[Mapping[str, float | None]]) -> dict[str, Spread |
 
 
 def verdict(figure: Figure, one: Spread | None, other: Spread | None) -> Literal["gain", "loss", "tie", ""]:
-    """Whether a method's figure is better than the reference's; a tie within the spread of the seeds.
+    """Whether a method's figure is better than the reference's; a tie within the spread of the seeds, or as printed.
 
     Returns: empty where either has no figure, or none is better than another.
     """
     if one is None or other is None or not figure.better:
         return ""
     difference = (one.mean - other.mean) * (1 if figure.better == "more" else -1)
-    if abs(difference) <= (one.spread or 0.0) + (other.spread or 0.0):
+    same = figure.shown(one.mean) == figure.shown(other.mean)
+    if same or abs(difference) <= (one.spread or 0.0) + (other.spread or 0.0):
         return "tie"
     return "gain" if difference > 0 else "loss"

@@ -27,7 +27,7 @@ from matplotlib.patheffects import withStroke
 
 from sgam_core.errors import InputError
 from sgam_core.types import Box
-from sgam_sfm.colours import Colour, distinct_colour
+from sgam_sfm.colours import Colour, distinct_colour, pale_colour
 from sgam_sfm.files import replacing
 
 WIDTH, MARGIN, GAP = 1600, 20, 10
@@ -235,12 +235,16 @@ def row_of(sizes: Sequence[tuple[int, int]], max_height: int = 760) -> list[Rect
 
 
 def draw_image(canvas: Canvas, view: ImageView, rect: Rect, *, tint: bool = False, calm: bool = True) -> Axes:
-    """An image, darkened (calm) so that what is drawn over it stands out. Returns: axes in the image's own pixels."""
+    """An image, darkened (calm) so that what is drawn over it stands out, or under pale fills of its labels (tint).
+
+    Returns: axes in the image's own pixels.
+    """
     axes = canvas.axes(rect, (0, view.size[0]), (view.size[1], 0))
     panel = resized(view.pixels, (rect.width, rect.height))
-    panel = _calm(panel) if calm else panel
     if tint and view.labels is not None:
-        panel = tinted(panel, view.labels)
+        panel = _filled(panel, view.labels)
+    elif calm:
+        panel = _calm(panel)
     # Pixels have the corner origin: the first one covers 0..1, where matplotlib alone would centre it on 0.
     extent = (0, view.size[0], view.size[1], 0)
     axes.imshow(panel, extent=extent, aspect="auto", interpolation="nearest")
@@ -447,15 +451,35 @@ def _calm(pixels: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.addWeighted(pixels, 0.68, grey, 0.12, 0))
 
 
+def _filled(pixels: UInt8[np.ndarray, "H W 3"], labels: Int32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "H W 3"]:
+    """An image as a bright drawing without colours of its own, under pale fills of its labels; 0 stays grey."""
+    colours, void, edges = _label_colours(labels, (pixels.shape[1], pixels.shape[0]), pale_colour)
+    light = 0.4 + 0.6 / 255 * cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)[..., None]
+    filled: np.ndarray = light * np.where(void, 225, colours)
+    filled[edges] = 255
+    return filled.astype(np.uint8)
+
+
 def tinted(
-    pixels: UInt8[np.ndarray, "H W 3"], labels: Int32[np.ndarray, "h w"], strength: float = 0.2
+    pixels: UInt8[np.ndarray, "H W 3"], labels: Int32[np.ndarray, "h w"], strength: float
 ) -> UInt8[np.ndarray, "H W 3"]:
     """An image with a tint for every label but 0, and lines where labels meet; labels may have another size."""
-    size = (pixels.shape[1], pixels.shape[0])
-    ids, index = np.unique(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT), return_inverse=True)
-    index = index.reshape(size[::-1])
-    tint = np.array([distinct_colour(int(i)) for i in ids], np.uint8)[index]
-    mixed = np.where((ids == 0)[index][..., None], pixels, cv2.addWeighted(pixels, 1 - strength, tint, strength, 0))
-    edges = cv2.morphologyEx(index.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8)) > 0
+    tint, void, edges = _label_colours(labels, (pixels.shape[1], pixels.shape[0]), distinct_colour)
+    mixed = np.where(void, pixels, cv2.addWeighted(pixels, 1 - strength, tint, strength, 0))
     mixed[edges] = (0.65 * mixed[edges] + 0.35 * 240).astype(np.uint8)
     return np.asarray(mixed)
+
+
+def _label_colours(
+    labels: Int32[np.ndarray, "h w"], size: tuple[int, int], colour_of: Callable[[int], Colour]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each pixel the colour of its label, whether it has none (0), and whether labels meet there.
+
+    Args: size: (width, height) of what is returned.
+    Returns: (H, W, 3), (H, W, 1) and (H, W).
+    """
+    ids, index = np.unique(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT), return_inverse=True)
+    index = index.reshape(size[::-1])
+    colours = np.array([colour_of(int(i)) for i in ids], np.uint8)[index]
+    edges = cv2.morphologyEx(index.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8)) > 0
+    return colours, (ids == 0)[index][..., None], edges

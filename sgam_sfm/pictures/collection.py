@@ -13,6 +13,7 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from sgam_core.wording import counted
 from sgam_sfm.pairs import Pair
 from sgam_sfm.pictures.canvas import (
     ALARM,
@@ -108,14 +109,15 @@ def _facts(picture: CollectionPicture, num_shown: int) -> list[str]:
     entries = picture.entries
     failed = sum(bool(entry.error) for entry in entries)
     lines = [
-        f"{len(entries)} images, {failed or 'none'} of them failed; {picture.num_listed} pairs listed, "
+        f"{counted(len(entries), 'image')}, {failed or 'none'} of them failed; "
+        f"{counted(picture.num_listed, 'pair')} listed, "
         f"{picture.num_matched} matched, {picture.num_failed or 'none'} failed"
         + ("." if all(entry.verified is None for entry in entries) else f", {len(picture.inliers)} verified.")
     ]
     models = sorted({entry.model for entry in entries if entry.model}, key=int)
     registered = {model: sum(entry.model == model for entry in entries) for model in models}
     if registered:
-        parts = (f"model {model} has {count} images" for model, count in registered.items())
+        parts = (f"model {model} has {counted(count, 'image')}" for model, count in registered.items())
         lines.append(f"{', '.join(parts)}; images without a pose: {sum(entry.model == '' for entry in entries)}.")
     if picture.missing:
         lines.append(f"Not in this picture: {'; '.join(picture.missing)}.")
@@ -174,7 +176,10 @@ def _caption(entry: ImageEntry) -> list[str]:
     model = entry.trouble or (f"model {entry.model}" if entry.model else "")
     if entry.keypoints is None:
         return [model] if model else []
-    return [f"{entry.keypoints} keypoints", f"{entry.verified} pairs" + (f", {model}" if model else "")]
+    return [
+        counted(entry.keypoints, "keypoint"),
+        counted(entry.verified or 0, "pair") + (f", {model}" if model else ""),
+    ]
 
 
 def _graph(picture: CollectionPicture, nodes: Sequence[int], labelled: Collection[int]) -> list[Section]:
@@ -182,7 +187,9 @@ def _graph(picture: CollectionPicture, nodes: Sequence[int], labelled: Collectio
     row = {picture.entries[node].name: index for index, node in enumerate(nodes)}
     among = [(pair, count) for pair, count in picture.inliers.items() if pair[0] in row and pair[1] in row]
     edges = sorted(among, key=lambda item: (-item[1], item[0]))[:MAX_EDGES][::-1]  # the strongest last, on top
-    lines = [f"{len(edges)} of {len(picture.inliers)} verified pairs are drawn" + _left_out(picture, among, edges)]
+    lines = [
+        f"{len(edges)} of {counted(len(picture.inliers), 'verified pair')} drawn" + _left_out(picture, among, edges)
+    ]
     if not edges:
         lines = ["No verified pair."] if picture.inliers or not picture.missing else ["No pair has been verified."]
     corners, side = circle(len(nodes)), min(440 + 20 * len(nodes), 900)
@@ -268,6 +275,6 @@ def _side(canvas: Canvas, place: Rect, picture: CollectionPicture, bar: Bar | No
 
 def _reason(entry: ImageEntry) -> str:
     if not entry.error:
-        return f"{entry.name}: {entry.no_pose or f'{entry.verified or 0} verified pairs'}"
+        return f"{entry.name}: {entry.no_pose or counted(entry.verified or 0, 'verified pair')}"
     # Messages of reading begin with the name, `image 'a.jpg' cannot ...`.
     return f"{entry.name}: {entry.error.removeprefix('image ').removeprefix(repr(entry.name)).lstrip(': ')}"

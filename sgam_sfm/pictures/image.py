@@ -11,22 +11,18 @@ import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from sgam_core.types import Area, AreaState, PairResult
+from sgam_core.wording import counted
 from sgam_sfm.colours import distinct_colour
 from sgam_sfm.pictures.canvas import (
     INNER,
     LENGTHS,
-    MARGIN,
-    MUTED,
     NEUTRAL,
     SHADE,
-    SMALL,
     Bar,
     Canvas,
     ImageView,
-    Rect,
     Section,
     Table,
     Tag,
@@ -35,15 +31,14 @@ from sgam_sfm.pictures.canvas import (
     evenly,
     header,
     heading,
-    rgb,
     row_of,
     stacked,
     table,
-    text_width,
 )
+from sgam_sfm.pictures.legend import label_legend
 from sgam_sfm.pictures.pair import DASHES
 
-MAX_BOXES, MAX_ROWS, MAX_DOTS, MAX_LABELS = 40, 20, 800, 12
+MAX_BOXES, MAX_ROWS, MAX_DOTS = 40, 20, 800
 MAX_LENGTH = 8
 """Images a track where the colours end."""
 
@@ -85,8 +80,8 @@ def draw_single_image(picture: ImagePicture) -> Figure:
     """Draw an image: labels and areas at the left, keypoints at the right, the areas in a table."""
     view, uses = picture.view, area_uses(picture.results)
     lines = [
-        f"{view.size[0]} x {view.size[1]} pixels; {len(picture.results)} of {picture.num_listed} pairs matched; "
-        f"{_keypoint_fact(picture)}."
+        f"{view.size[0]} x {view.size[1]} pixels; "
+        f"{len(picture.results)} of {counted(picture.num_listed, 'pair')} matched; {_keypoint_fact(picture)}."
     ]
     if picture.missing:
         lines.append(f"Not in this picture: {'; '.join(picture.missing)}.")
@@ -96,7 +91,7 @@ def draw_single_image(picture: ImagePicture) -> Figure:
             "Areas and keypoints" if picture.keypoints is not None else "Areas", _facts(picture, uses), _bar(picture)
         ),
         _panels(picture, uses),
-        _label_legend(picture),
+        label_legend([view], picture.label_names),
     ]
     if uses:
         sections += [heading("The areas in numbers"), table(_table(uses, picture.label_names))]
@@ -121,22 +116,22 @@ def _keypoint_fact(picture: ImagePicture) -> str:
         return "no keypoints yet"
     count, lengths = len(picture.keypoints), picture.track_lengths
     if lengths is None:
-        return f"{count} keypoints"
+        return counted(count, "keypoint")
     seen = lengths[lengths > 0]
     mean = f", seen by {seen.mean():.1f} images on average" if len(seen) else ""
-    return f"{count} keypoints, {len(seen)} of them with a point in model {picture.model}{mean}"
+    return f"{counted(count, 'keypoint')}, {len(seen)} of them with a point in model {picture.model}{mean}"
 
 
 def _facts(picture: ImagePicture, uses: Sequence[AreaUse]) -> list[str]:
     hidden = len(uses) - MAX_BOXES
-    areas = f"{len(uses)} areas over all pairs, solid where one of their matches was kept" + (
+    areas = f"{counted(len(uses), 'area')} (outlines) over all pairs, solid where one of their matches was kept" + (
         f"; {hidden} of them are not drawn." if hidden > 0 else "."
     )
     if picture.keypoints is None:
         return [areas]
     shown, count = min(MAX_DOTS, len(picture.keypoints)), len(picture.keypoints)
     rings = "; rings: those without a point" if picture.track_lengths is not None else ""
-    return [areas, f"Dots: {shown} of {count} keypoints{rings}."]
+    return [areas, f"Dots: {shown} of {counted(count, 'keypoint')}{rings}."]
 
 
 def _bar(picture: ImagePicture) -> Bar | None:
@@ -187,38 +182,6 @@ def _panels(picture: ImagePicture, uses: Sequence[AreaUse]) -> Section:
     return Section(rects[0].height + 8, draw)
 
 
-def _label_legend(picture: ImagePicture) -> Section:
-    """The colours of the labels that cover most of the image."""
-    labels = picture.view.labels
-    if labels is None:
-        return Section(0, lambda canvas, top: None)
-    ids, counts = np.unique(labels, return_counts=True)
-    order = [n for n in np.argsort(-counts, kind="stable").tolist() if ids[n] != 0]
-    items = [
-        (int(ids[n]), f"{picture.label_names.get(int(ids[n]), f'label {ids[n]}')}: {counts[n] / labels.size:.0%}")
-        for n in order[:MAX_LABELS]
-    ]
-    places, left, line = [], 0.0, 0
-    for label, text in items:
-        width = 24 + text_width(text, SMALL) + 22
-        if left + width > INNER:
-            left, line = 0.0, line + 1
-        places.append((left, line, label, text))
-        left += width
-    rest = f"; {len(order) - MAX_LABELS} smaller labels are not listed" if len(order) > MAX_LABELS else ""
-    void = float(np.mean(labels == 0))
-    note = f"{void:.0%} of the image has no label{rest}." if void >= 0.005 or rest else ""
-
-    def draw(canvas: Canvas, top: int) -> None:
-        axes = canvas.axes(Rect(MARGIN, top, INNER, 26 * (line + 1)), (0, INNER), (26 * (line + 1), 0))
-        for x, row, label, text in places:
-            axes.add_patch(Rectangle((x, 26 * row + 5), 16, 16, facecolor=rgb(distinct_colour(label))))
-            canvas.text(MARGIN + x + 24, top + 26 * row + 3, text, SMALL, MUTED)
-        canvas.text(MARGIN, top + 26 * (line + 1) + 3, note, SMALL, MUTED)
-
-    return Section(26 * (line + 1 + bool(note)) + 8, draw)
-
-
 def _table(uses: Sequence[AreaUse], names: Mapping[int, str]) -> Table:
     widths = (74, 150, 210, 190, 100, 120, 130, 110)
     rest = len(uses) - MAX_ROWS
@@ -238,5 +201,5 @@ def _table(uses: Sequence[AreaUse], names: Mapping[int, str]) -> Table:
             for number, use in enumerate(uses[:MAX_ROWS])
         ],
         colours=[distinct_colour(number) for number in range(len(uses[:MAX_ROWS]))],
-        rest=f"{rest} more areas." if rest > 0 else "",
+        rest=f"{counted(rest, 'more area')}." if rest > 0 else "",
     )

@@ -17,6 +17,7 @@ from matplotlib.patheffects import withStroke
 
 from sgam_core.geometry import sampson_distance
 from sgam_core.types import AreaMatch, AreaState, PairResult, TwoViewModel
+from sgam_core.wording import counted
 from sgam_sfm.colmap.reading import MatchedPoints
 from sgam_sfm.colours import distinct_colour
 from sgam_sfm.pictures.canvas import (
@@ -48,6 +49,7 @@ from sgam_sfm.pictures.canvas import (
     table,
     text_width,
 )
+from sgam_sfm.pictures.legend import label_legend
 
 MAX_BOXES, MAX_ROWS, MAX_LINES, MAX_DOTS = 60, 20, 90, 500
 MAX_DISTANCE = 4.0
@@ -66,6 +68,7 @@ _LEGENDS = {
     AreaState.UNRESOLVED: "doubtful, unresolved (?)",
     AreaState.SKIPPED: "skipped (-)",
 }
+_GUIDED = "Guided areas are windows on the ground that a first round found in both images, whatever its labels."
 _MARKS = {AreaState.KEPT: "", AreaState.REJECTED: _CROSS, AreaState.UNRESOLVED: "?", AreaState.SKIPPED: "-"}
 
 
@@ -98,7 +101,7 @@ def draw_pair(picture: PairPicture) -> Figure:
     sections = [header(" - ".join(view.name for view in views), _facts(picture))]
     if result.areas or any(view.labels is not None for view in views):
         title = heading("Areas", _area_facts(result)) if result.areas else heading("Labels")
-        sections += [title, _areas(views, result)]
+        sections += [title, _areas(views, result), label_legend(views, picture.label_names)]
     sections += _matches(views, picture.matching)
     if picture.plain is not None:
         sections += _matches(views, picture.plain)
@@ -114,11 +117,11 @@ def mark(area: AreaMatch, number: int) -> str:
 
 def _facts(picture: PairPicture) -> list[str]:
     result = picture.matching.result
-    lines = [f"No areas, {len(result.matches)} point matches."]
+    lines = [f"No areas, {counted(len(result.matches), 'point match')}."]
     if result.areas:
         lines = [
-            f"{len(result.areas)} area matches, {len(result.matches)} point matches; kept areas cover "
-            f"{result.coverage0:.0%} of the left image and {result.coverage1:.0%} of the right one."
+            f"{counted(len(result.areas), 'area match')}, {counted(len(result.matches), 'point match')}; "
+            f"kept areas cover {result.coverage0:.0%} of the left image and {result.coverage1:.0%} of the right one."
         ]
     if result.fallback:
         lines.append(f"Matched as whole images: {result.fallback}.")
@@ -141,8 +144,11 @@ def _area_facts(result: PairResult) -> list[str]:
     line = states
     if predicted:
         line += f"; {predicted} of those kept were doubtful, and chosen by geometry (GP)"
+    kinds = Counter(area.area0.kind for area in result.areas)
+    line += f"; by kind: {', '.join(f'{count} {kind}' for kind, count in kinds.items())}"
     hidden = len(result.areas) - MAX_BOXES
-    return [f"{line}." + (f" {hidden} of {len(result.areas)} are not drawn." if hidden > 0 else "")]
+    told = [_GUIDED] if kinds["guided"] else []
+    return [f"{line}." + (f" {hidden} of {len(result.areas)} are not drawn." if hidden > 0 else ""), *told]
 
 
 def _areas(views: tuple[ImageView, ImageView], result: PairResult) -> Section:
@@ -175,7 +181,8 @@ def _legend(canvas: Canvas, top: int, result: PairResult) -> None:
         (_LEGENDS[state], DASHES[state]) for state in AreaState if any(area.state is state for area in result.areas)
     ]
     axes = canvas.axes(Rect(MARGIN, top, INNER, 24), (0, INNER), (24, 0))
-    left = 0.0
+    canvas.text(MARGIN, top, title := "Outlines are areas:" if states else "", SMALL, MUTED)
+    left = text_width(title, SMALL) + 20
     for text, dashes in states:
         axes.add_line(Line2D((left, left + 48), (12, 12), color=INK, linewidth=2, linestyle=line_style(dashes)))
         canvas.text(MARGIN + left + 58, top, text, SMALL, MUTED)
@@ -247,24 +254,28 @@ def _match_facts(matching: Matching, num_lines: int, num_dots: int) -> list[str]
         distances = _distances(model, result.matches.points0, result.matches.points1)
         near = np.count_nonzero(distances <= 1) / count
         found = (
-            f"{count} point matches, {near:.0%} of them within 1 pixel of the pair's "
+            f"{counted(count, 'point match')}, {near:.0%} of them within 1 pixel of the pair's "
             f"{'essential' if model.calibrated else 'fundamental'} matrix (median {np.median(distances):.2f})"
         )
     else:
-        found = f"{count} point matches; no two-view geometry was found, so that their colour tells no distance"
+        found = (
+            f"{counted(count, 'point match')}; no two-view geometry was found, so that their colour tells no distance"
+        )
     if inliers is None:
         checked = "not verified by COLMAP"
     elif len(inliers[0]):
-        checked = f"{len(inliers[0])} inliers after COLMAP's verification"
+        checked = f"{counted(len(inliers[0]), 'inlier')} after COLMAP's verification"
     else:
         checked = "no inlier was left by COLMAP's verification"
     verified = inliers is not None and len(inliers[0]) > 0
-    lined = f"{num_lines} of {len(inliers[0])} inliers" if inliers is not None and verified else f"{num_lines} matches"
-    return [f"{found}; {checked}.", f"Dots: {num_dots} of {count} point matches. Lines: {lined}."]
+    lined = counted(num_lines, "match")
+    if inliers is not None and verified:
+        lined = f"{num_lines} of {counted(len(inliers[0]), 'inlier')}"
+    return [f"{found}; {checked}.", f"Dots: {num_dots} of {counted(count, 'point match')}. Lines: {lined}."]
 
 
 def _table(result: PairResult, names: Mapping[int, str]) -> Table:
-    widths = (74, 140, 170, 140, 180, 90, 110, 110)
+    widths = (64, 120, 120, 130, 140, 80, 100, 90)
     areas = result.areas[:MAX_ROWS]
     rest = Counter(area.state for area in result.areas[MAX_ROWS:])
     reason = WIDTH - 2 * MARGIN - sum(widths)

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sgam_core.wording import counted
 from sgam_sfm.colmap.mapping import MappingSummary
 from sgam_sfm.colmap.reading import read_camera_ids
 from sgam_sfm.colmap.verification import VerificationSummary
@@ -135,7 +136,9 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     table = Table(show_header=False, box=None)
     table.add_row("images", f"{images['used']} used, {len(images['failed'])} failed")
     dropped = sum(pairs[reason] for reason in ("repeated", "reversed", "self"))
-    told = f"; {dropped} lines dropped that repeat or reverse a pair, or name an image twice" if dropped else ""
+    told = (
+        f"; {counted(dropped, 'line')} dropped: pairs repeated or reversed, or an image named twice" if dropped else ""
+    )
     table.add_row(
         "pairs",
         f"{pairs['matched']} matched, {len(pairs['failed']) + pairs['of_unusable_images']} failed, "
@@ -145,7 +148,9 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
         stability = summary["labels"]["stability"][str(summary["labels"]["num_labels_chosen"])]
         table.add_row("labels", f"{summary['labels']['num_labels_chosen']}, runs agree by {stability:.2f}")
     if summary["labels"].get("failed"):
-        table.add_row("labels", f"{len(summary['labels']['failed'])} images have none that can be used (log.txt)")
+        table.add_row(
+            "labels", f"{counted(len(summary['labels']['failed']), 'image')} without any that can be used (log.txt)"
+        )
     if pairs["areas"]:
         kept = sum(count for name, count in pairs["areas"].items() if name.endswith("_kept"))
         gain = pairs["mean_resolution_gain"]
@@ -156,13 +161,15 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
             f"{pairs['mean_coverage']:.0%} of the image, {gain:.1f}x the resolution",
         )
     if summary["labels"]:
-        told = ", ".join(f"{count} pairs: {reason}" for reason, count in pairs["fallbacks"].items())
+        told = ", ".join(f"{counted(count, 'pair')}: {reason}" for reason, count in pairs["fallbacks"].items())
         table.add_row("fallbacks", f"matched as whole images: {told}" if told else "none")
     if pairs["pairs_turned"] or pairs["pairs_zoomed"]:
-        text = f"{pairs['pairs_turned']} pairs with an image sideways, {pairs['pairs_zoomed']} with one from nearer"
-        table.add_row("looks", text)
+        turned = f"{counted(pairs['pairs_turned'], 'pair')} with an image sideways"
+        table.add_row("looks", f"{turned}, {pairs['pairs_zoomed']} with one from nearer")
     if pairs["pairs_with_limits"]:
-        table.add_row("limits", f"reached in {pairs['pairs_with_limits']} pairs (`sgam-sfm show` tells which)")
+        table.add_row(
+            "limits", f"reached in {counted(pairs['pairs_with_limits'], 'pair')} (`sgam-sfm show` tells which)"
+        )
     table.add_row("matches", f"{pairs['raw_matches']} raw, {summary['keypoints']['matches']} as tracks")
     _add_models(summary, table)
     console.print(table)
@@ -172,7 +179,7 @@ def print_shard(summary: Mapping[str, Any], console: Console) -> None:
     """A table for the terminal of what a shard did."""
     pairs, shard = summary["pairs"], summary["shard"]
     table = Table(show_header=False, box=None)
-    table.add_row("shard", f"{shard['shard']}, {shard['blocks']} blocks of pairs")
+    table.add_row("shard", f"{shard['shard']}, {counted(shard['blocks'], 'block')} of pairs")
     table.add_row("images", f"{summary['images']['used']} in all shards, {len(summary['images']['failed'])} failed")
     table.add_row("pairs", f"{pairs['matched']} of {pairs['listed']} matched, {len(pairs['failed'])} failed")
     table.add_row("matches", f"{pairs['raw_matches']} raw")
@@ -196,7 +203,7 @@ def _add_models(content: Mapping[str, Any], table: Table) -> None:
     for number, model in enumerate(content["models"]):
         table.add_row(
             f"model {number}",
-            f"{model['registered']} of {model['total']} images, {model['points']} points, "
+            f"{model['registered']} of {counted(model['total'], 'image')}, {counted(model['points'], 'point')}, "
             f"{model['mean_images_per_track']:.2f} images a track, {model['mean_reprojection_error_px']:.3f} px",
         )
     if not content["models"]:

@@ -222,7 +222,7 @@ def test_a_pair_that_cannot_be_matched_counts_as_failed(folder, tmp_path, capsys
     monkeypatch.setattr("sgam_sfm.runs.matching.read_image", read)
     arguments = [*common(folder, tmp_path / "out"), "--area-matcher", "covisible"]
     assert cli.run(["evaluate", *arguments]) == DONE
-    assert "3 pairs could not be matched and count as failed" in capsys.readouterr().err
+    assert "3 pairs could not be matched, counted as failed" in capsys.readouterr().err
     for variant in json.loads((tmp_path / "out" / "evaluate.json").read_text())["variants"]:
         failed = [pair for pair in variant["pairs"] if names[0] in pair["pair"]]
         assert all(pair["error"] == f"'{names[0]}' has gone" for pair in failed)

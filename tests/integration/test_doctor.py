@@ -1,8 +1,12 @@
 """`sgam-sfm doctor`: what it finds here, and what it says of a machine that is not well."""
 
+import io
 from types import SimpleNamespace
 
+from rich.console import Console
+
 from sgam_sfm import cli, doctor
+from sgam_sfm.commands.doctor import DoctorOptions, run
 from sgam_sfm.exit_codes import DONE, ERROR, USAGE
 
 
@@ -37,3 +41,13 @@ def test_a_self_test_that_finds_nothing_is_bad(monkeypatch, capsys):
 def test_a_device_that_is_not_there(capsys):
     assert cli.run(["doctor", "--device", "cuda:7", "--no-self-test"]) == USAGE
     assert "--device 'cuda:7' cannot be used" in capsys.readouterr().err
+
+
+def test_a_terminal_is_told_that_it_takes_a_while_and_a_file_is_not(capsys):
+    for terminal in (True, False):
+        console = Console(file=io.StringIO(), force_terminal=terminal)
+        assert run(DoctorOptions(self_test=False), console) == DONE
+        told = console.file.getvalue()
+        assert ("the first time takes a minute or two" in told) is terminal
+        assert bool(told) is terminal
+        assert "GB free at" in capsys.readouterr().out

@@ -135,7 +135,7 @@ def test_no_photo_with_a_pose(finished, photos, tmp_path):
     (tmp_path / "pairs.txt").write_text("y.png a.png\n")
     assert cli.run([*given, "--pairs", str(tmp_path / "pairs.txt")]) == NO_MODEL
     reason = record(output)["failed"]["y.png"]
-    assert "matches with 1 references show " in reason
+    assert "matches with 1 reference show " in reason
     assert reason.endswith(" points of the model; 400 are needed (--min-inliers)")
     assert (output / "poses.txt").read_text() == ""
 

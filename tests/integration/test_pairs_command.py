@@ -70,7 +70,7 @@ def test_exhaustive_says_what_comes_next(folder, room, tmp_path, capsys):
     output = tmp_path / "my lists" / "pairs.txt"
     assert run(folder, output, "exhaustive") == (DONE, list(combinations(sorted(room.images), 2)))
     text = told(capsys)
-    assert f"pairs      15 of 15 that 6 images make, in {output}" in text
+    assert f"pairs      15 of 15 that 6 images can make, in {output}" in text
     assert "graph      one part: pairs join all 6 images" in text
     command = shlex.split(re.search(r"next +(.*)", text)[1])
     assert command[:2] == ["sgam-sfm", "match"]
@@ -89,7 +89,7 @@ def test_sequential_joins_neighbours_and_warns_of_gaps(tmp_path, capsys):
     assert code == DONE
     assert pairs == [("a/f10.png", "a/f11.png"), ("a/f10.png", "a/f9.png"), ("b/f1.png", "b/f2.png")]
     text = told(capsys)
-    assert "warning    1 images are in no pair and will have no pose: alone.png" in text
+    assert "warning    1 image in no pair, and so without a pose: alone.png" in text
     assert "no pair joins these 2 groups: 3 images (a/f10.png, ...), 2 images (b/f1.png, ...); each becomes" in text
 
 
@@ -130,7 +130,7 @@ def test_retrieval_by_labels_names_images_without_a_map(folder, tmp_path, capsys
     assert not any("view03.jpg" in pair for pair in pairs)
     text = told(capsys)
     assert "no labels for 'view03.jpg'; expected 'view03.jpg.png' or 'view03.png' in" in " ".join(text.split())
-    assert "failed     1 images cannot be compared: view03.jpg" in text
+    assert "failed     1 image that cannot be compared: view03.jpg" in text
     assert "graph      one part: pairs join the other 5 images" in text
 
 

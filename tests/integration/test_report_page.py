@@ -218,10 +218,13 @@ def test_matrices_change_what_they_show(browser, report):
     browser.open(report, 1280)
     content = "document.querySelector('.matrices canvas').toDataURL()"
     before = browser.value(content)
-    assert browser.value("document.querySelector('#scale').innerText").split() == ["0", "60"]
+    assert browser.value("document.querySelector('#scale').innerText").split() == ["0", "60", "inliers"]
     browser.click("input[value=change]")
     assert browser.value(content) != before
-    assert browser.value("document.querySelector('#scale').innerText").split() == ["-30", "lost", "+30", "gained"]
+    assert browser.value("document.querySelector('#scale').innerText").split("\n") == [
+        "-30 inliers lost",
+        "+30 inliers gained",
+    ]
 
 
 def test_gallery_opens_by_click_and_enter_and_closes_by_escape(browser, report):
@@ -238,6 +241,28 @@ def test_gallery_opens_by_click_and_enter_and_closes_by_escape(browser, report):
     browser.click("#large .close")
     assert browser.value("document.querySelector('#large').open") is False
     assert browser.problems == []
+
+
+def test_axes_are_named_and_counts_are_whole(browser, report):
+    browser.open(report, 1280)
+    draw_everything(browser)
+    flat = "[...document.querySelectorAll('.plot')].filter(plot => plot.id !== 'scene')"
+    titles = browser.value(f"{flat}.map(plot => ['x', 'y'].map(a => plot.querySelector(`.${{a}}title`).textContent))")
+    assert titles[0] == ["pose error, degrees", "share of pairs"]
+    assert all(title for pair in titles for title in pair)
+    ticks = "(plot, axis) => [...document.querySelectorAll(`#${plot} .${axis}tick text`)].map(tick => tick.textContent)"
+    assert browser.value(f"({ticks})('coverage', 'x')") == list("123456")
+    assert all(tick.isdigit() for axis in "xy" for tick in browser.value(f"({ticks})('tracks', '{axis}')"))
+    assert {"5", "10", "20", "50"} <= set(browser.value(f"({ticks})('tracks', 'y')"))
+
+
+def test_pictures_of_the_gallery_are_whole(browser, report):
+    browser.open(report, 1280)
+    browser.centre(".gallery img")
+    browser.wait("document.querySelector('.gallery img').complete")
+    image = "document.querySelector('.gallery img')"
+    shown = browser.value(f"{image}.clientWidth / {image}.clientHeight")
+    assert shown == pytest.approx(browser.value(f"{image}.naturalWidth / {image}.naturalHeight"), rel=0.02)
 
 
 def test_models_are_toggled_in_the_legend(browser, report):

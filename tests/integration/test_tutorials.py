@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -79,6 +81,12 @@ def test_the_folder_for_splatting_has_what_trainers_ask_for(splat):
         with PIL.Image.open(splat / folder / PHOTOS[0]) as image:
             assert width < image.width < 2 * width
     assert {path.name for path in (splat / "sparse/0").iterdir()} >= {"cameras.bin", "images.bin", "points3D.bin"}
+
+
+def test_the_script_can_be_run_again(tutorial, splat):
+    subprocess.run([sys.executable, "undistort.py", "out/sparse/0", "photos", splat.name], cwd=tutorial, check=True)
+    assert (splat / "sparse/0/points3D.bin").is_file()
+    assert not (splat / "sparse/points3D.bin").exists()
 
 
 def test_a_package_of_its_own_brings_a_matcher_and_a_segmenter(tutorial, tmp_path):

@@ -76,5 +76,5 @@ def test_the_command(tmp_path, capsys):
     assert raw_matches(tmp_path / "text/matches.txt") == {("a.jpg", "sub/b.jpg"): [[1, 0]]}
     assert len(features(tmp_path / "text/keypoints/sub/b.jpg.txt")) == 1
     told = capsys.readouterr().err
-    assert "written    2 keypoint files, 1 pairs in matches.txt" in told
+    assert "written    2 keypoint files, 1 pair in matches.txt" in told
     assert f"--match_list_path {tmp_path}/text/matches.txt --match_type raw" in told

@@ -23,11 +23,20 @@ def test_mean_and_spread_over_seeds():
         (MORE, (10.0, None), (10.0, None), "tie"),
         (MORE, (12.0, 1.0), (10.0, 1.0), "tie"),
         (MORE, (12.1, 1.0), (10.0, 1.0), "gain"),
+        (LESS, (0.4004, None), (0.4001, None), "tie"),  # 0.400 both
+        (LESS, (0.4006, None), (0.4004, None), "loss"),  # 0.401 and 0.400
         (PRICE, (12.0, None), (10.0, None), ""),
     ],
 )
 def test_a_difference_within_the_spread_is_a_tie(figure, one, other, expected):
     assert verdict(figure, Spread(mean=one[0], spread=one[1]), Spread(mean=other[0], spread=other[1])) == expected
+
+
+def test_lengths_are_in_the_unit_of_the_truth():
+    centre = next(figure for figure in FIGURES if figure.name == "center_error")
+    assert centre.titled({"unit": "metres"}) == "centre error, metres"
+    assert centre.titled({"unit": "unknown"}) == centre.titled(None) == "centre error, units of the truth"
+    assert LESS.titled(None) == "reprojection, px"
 
 
 def test_nothing_is_said_where_a_figure_is_missing():

@@ -276,7 +276,7 @@ class TestPage:
     def test_says_what_is_missing_and_bounded(self, page):
         assert "no model: no pair was verified" in page.text
         assert "its budget could not be met" in page.text
-        assert "2 pairs were matched as whole images: no geometry" in page.text
+        assert "2 pairs matched as whole images: no geometry" in page.text
         for sentence in Bounds().sentences():
             assert sentence in page.text
 
@@ -507,8 +507,8 @@ class TestParts:
         content = compared[1]
         rows = {row.title: row for group in table.table_groups(content) for row in group.rows}
         assert rows["matching, s"].cells[0] == table.Cell("3", "0.75x")
-        assert rows["AUC@1"].cells[0] == table.Cell("80.0", "+5.0", "gain", "▲")
-        assert rows["AUC@1"].cells[3] == table.Cell("")
+        assert rows["AUC@1°, %"].cells[0] == table.Cell("80.0", "+5.0", "gain", "▲")
+        assert rows["AUC@1°, %"].cells[3] == table.Cell("")
         assert "inlier ratio" not in rows
         assert [card.is_reference for card in table.cards(content)] == [False, True, False, False]
         assert table.cards(content)[1].prices == (("pixels", "3 Mpx"), ("matching", "4 s"))

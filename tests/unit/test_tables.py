@@ -27,3 +27,15 @@ def test_a_terminal_gets_some_columns_at_a_time():
     text = printed(terminal=True)
     assert max(map(len, text.splitlines())) <= 80
     assert text.count("points") == 2
+
+
+def test_a_narrow_terminal_breaks_names_of_methods_and_no_word_of_a_figure():
+    file = io.StringIO()
+    console = Console(file=file, width=44, force_terminal=True, color_system=None)
+    name = "sgam:superpoint-lightglue-with-a-very-long-name"
+    print_figures("title", [name, "sift"], [("rotation error, degrees", ["[green]0.123[/]", "123456 ±12"])], console)
+    lines = file.getvalue().splitlines()
+    assert max(map(len, lines)) <= 44
+    assert all(word in file.getvalue() for word in ("rotation", "error,", "degrees", "0.123", "123456 ±12", "sift"))
+    names = "".join(line.split("┃")[2].strip() for line in lines[2:10] if line.startswith("┃"))
+    assert names == name.replace(":", "")

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from sgam_core.wording import counted
 from sgam_sfm.comparison.figures import FIGURES, TIMES, Figure
 
 MARKS = {"gain": "▲", "loss": "▼", "tie": "="}
@@ -104,8 +105,7 @@ def remarks(content: Mapping[str, Any]) -> list[tuple[str, str]]:
         # Whole images are all that `none` matches.
         fallbacks = {} if method["name"].startswith("none:") else run["fallbacks"]
         for reason, count in fallbacks.items():
-            pairs = "pair was" if count == 1 else "pairs were"
-            found.append((method["name"], f"{count} {pairs} matched as whole images: {reason}"))
+            found.append((method["name"], f"{counted(count, 'pair')} matched as whole images: {reason}"))
     return found
 
 
@@ -113,7 +113,7 @@ def _row(figure: Figure, content: Mapping[str, Any]) -> Row:
     hint = {"more": "more is better", "less": "less is better", "": ""}[figure.better]
     reference = _reference(content)
     cells = tuple(_cell(figure, method, reference) for method in content["methods"])
-    return Row(figure.title, hint, cells)
+    return Row(figure.titled(content["collection"]["ground_truth"]), hint, cells)
 
 
 def _cell(figure: Figure, method: Mapping[str, Any], reference: Mapping[str, Any]) -> Cell:
@@ -129,7 +129,7 @@ def _cell(figure: Figure, method: Mapping[str, Any], reference: Mapping[str, Any
     verdict = method["verdicts"].get(figure.name, "")
     if not verdict:
         return Cell(text, _times(value["mean"], base) if base else "")
-    return Cell(text, _signed(value["mean"] - base, figure.digits), verdict, MARKS[verdict])
+    return Cell(text, _signed(figure.shown(value["mean"]) - figure.shown(base), figure.digits), verdict, MARKS[verdict])
 
 
 def _reference(content: Mapping[str, Any]) -> Mapping[str, Any]:

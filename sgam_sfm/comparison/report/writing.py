@@ -12,6 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
+from sgam_core.wording import counted
 from sgam_sfm.comparison.harder import cut_folder, read_windows
 from sgam_sfm.comparison.report import gallery, geometry, plots, table
 from sgam_sfm.comparison.report.bounds import Bounds, evenly_of
@@ -73,6 +74,7 @@ def render(output: Path, content: Mapping[str, Any], bounds: Bounds) -> str:
         groups=table.table_groups(content),
         remarks=table.remarks(content) + [(runs[number].name, _UNALIGNED) for number in unaligned],
         marks=table.MARKS,
+        counted=counted,
         data=_finite(data),
         gallery=gallery.make_gallery(runs, reference, images, bounds),
         bounds=bounds.sentences(),

@@ -35,6 +35,20 @@
     type: "scatter", mode: "lines", name: methodName(trace.method), x: trace.x, y: trace.y,
     line: { color: colour(own(trace.method)), width: 2, dash: dashOf(trace.method) }, ...more,
   });
+  // Counts are whole: no axis has a tick between two of them.
+  const countAxis = (title, traces, more = {}) => {
+    const counts = traces.flatMap((trace) => trace.x);
+    return axis(title, { ...(Math.max(...counts) - Math.min(...counts) <= 10 ? { dtick: 1 } : {}), tickformat: ",d", ...more });
+  };
+  const logCountAxis = (title, traces) => {
+    const counts = traces.flatMap((trace) => trace.y);
+    const [low, high] = [0.7 * Math.min(...counts), 1.5 * Math.max(...counts)];
+    const decades = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9].map((power) => 10 ** power);
+    const ticks = (high / low > 1000 ? [1] : [1, 2, 5]).flatMap((digit) => decades.map((decade) => digit * decade));
+    return axis(title, {
+      type: "log", range: [Math.log10(low), Math.log10(high)], tickvals: ticks, ticktext: ticks.map((tick) => tick.toLocaleString("en")),
+    });
+  };
   const degrees = [0.01, 0.1, 1, 10, 180];
   const degreeAxis = (title, traces, of, ticks) => axis(title, {
     type: "log", range: [-2, Math.log10(Math.min(200, 1.4 * Math.max(5, ...traces.flatMap((trace) => trace[of]))))],
@@ -47,7 +61,7 @@
       return [
         {
           type: "scatter", mode: "markers", name: methodName(trace.method), legendgroup: `${trace.method}`,
-          x: trace.x, y: trace.y, text: trace.pairs.map(pairName), marker: { ...look, size: 6, opacity: 0.6 },
+          x: trace.x, y: trace.y, cliponaxis: false, text: trace.pairs.map(pairName), marker: { ...look, size: 6, opacity: 0.6 },
           hovertemplate: `%{text}<br>%{x:.3g}${unit}, error %{y:.3g}°<extra>%{fullData.name}</extra>`,
         },
         {
@@ -57,7 +71,7 @@
         },
       ];
     }),
-    layout: { xaxis: axis(title, { ticksuffix: unit }), yaxis: degreeAxis("pose error", traces, "y", degrees) },
+    layout: { xaxis: axis(title, { ticksuffix: unit }), yaxis: degreeAxis("pose error, degrees", traces, "y", degrees) },
   });
 
   const edges = [0, 1, 2, 0, 3, 4, 0, null, 1, 2, 3, 4, 1, null];
@@ -92,18 +106,18 @@
         line: { ...line(trace).line, shape: "hv" }, hovertemplate: "%{y:.1f} % of pairs within %{x:.3g}°<extra>%{fullData.name}</extra>",
       })),
       layout: {
-        xaxis: degreeAxis("pose error", data.curves, "x", narrow() ? degrees : [0.01, 0.03, 0.1, 0.5, 1, 3, 5, 20, 60, 180]),
-        yaxis: axis("pairs", { range: [0, 102], ticksuffix: " %" }),
+        xaxis: degreeAxis("pose error, degrees", data.curves, "x", narrow() ? degrees : [0.01, 0.03, 0.1, 0.5, 1, 3, 5, 20, 60, 180]),
+        yaxis: axis("share of pairs", { range: [0, 102], ticksuffix: " %" }),
       },
     }),
-    by_angle: () => scattered(data.by_angle, "angle between views", "°"),
-    by_scale: () => scattered(data.by_scale, "change of scale", "x"),
+    by_angle: () => scattered(data.by_angle, "angle between views, degrees", "°"),
+    by_scale: () => scattered(data.by_scale, "change of scale, times", "x"),
     coverage: () => ({
       traces: data.coverage.map((trace) => line(trace, {
         mode: trace.x.length < 60 ? "lines+markers" : "lines", text: trace.pairs.map(pairName),
         hovertemplate: "%{text}<br>%{y:.0f} % in kept areas<extra>%{fullData.name}</extra>",
       })),
-      layout: { xaxis: axis("pairs, most covered first"), yaxis: axis("in kept areas", { range: [0, 102], ticksuffix: " %" }), showlegend: true },
+      layout: { xaxis: countAxis("rank of the pair, most covered first", data.coverage), yaxis: axis("share in kept areas", { range: [0, 102], ticksuffix: " %" }), showlegend: true },
     }),
     stages: () => ({
       traces: Object.entries(data.stages).map(([stage, seconds], index) => ({
@@ -115,7 +129,7 @@
       layout: {
         barmode: "stack", bargap: 0.35, xaxis: axis("seconds"),
         uniformtext: { mode: "hide", minsize: 11 }, legend: { ...layout().legend, traceorder: "normal" },
-        yaxis: axis("", {
+        yaxis: axis("method", {
           autorange: "reversed", tickvals: data.methods.map((_, n) => n),
           ticktext: data.methods.map((_, n) => (narrow() ? methodName(n).replace(/[:@]/g, "$&<br>") : methodName(n))),
         }),
@@ -126,7 +140,7 @@
         mode: "lines+markers", marker: { size: 7, symbol: marks[trace.method % marks.length] },
         hovertemplate: "%{y:,} points seen by %{x} images<extra>%{fullData.name}</extra>",
       })),
-      layout: { xaxis: axis("images", { rangemode: "tozero" }), yaxis: axis("points", { type: "log", dtick: 1 }) },
+      layout: { xaxis: countAxis("images that see a point", data.tracks), yaxis: logCountAxis("number of points", data.tracks) },
     }),
     scene: () => {
       const away = narrow() ? 1.35 : 1;
@@ -189,8 +203,8 @@
       context.putImageData(pixels, 0, 0);
     });
     const [low, bar, high] = byId("scale").children;
-    low.textContent = kind === "change" ? `${-most} lost` : "0";
-    high.textContent = kind === "change" ? `+${most} gained` : `${most}`;
+    low.textContent = kind === "change" ? `${-most} inliers lost` : "0";
+    high.textContent = kind === "change" ? `+${most} inliers gained` : `${most} ${kind === "matches" ? "raw matches" : "inliers"}`;
     const stops = kind === "change" ? ["minus", "zero", "plus"] : ["from", "to"];
     bar.style.background = `linear-gradient(90deg, ${stops.map(colour).join(", ")})`;
   };
@@ -213,7 +227,7 @@
     }
     const change = inliers[number][cell] - inliers[data.reference][cell];
     const several = counts[cell] > 1 ? `, mean of ${counts[cell]} pairs` : "";
-    const against = number === data.reference ? "" : `, ${change > 0 ? "gained +" : change < 0 ? "lost " : "tied "}${Math.round(change * 10) / 10}`;
+    const against = number === data.reference ? "" : `, ${change > 0 ? "gained +" : change < 0 ? "lost " : "equal "}${Math.round(change * 10) / 10}`;
     tip.replaceChildren(
       images,
       paragraph(`${binName(bins[row])} - ${binName(bins[column])}`),
