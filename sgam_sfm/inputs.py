@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sgam_core.errors import InputError, OptionError
+from sgam_core.wording import counted
 from sgam_sfm.colmap.appending import require_no_descriptors
 from sgam_sfm.colmap.cameras import CameraInfo
 from sgam_sfm.colmap.image_import import CameraOptions, import_cameras
@@ -88,7 +89,7 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
         )
     used = {name for pair in pairs.pairs for name in pair}
     if unused := sorted(images.keys() - used):
-        _log.warning("%d of %d images are in no pair, and get no pose: %s", len(unused), len(images), listing(unused))
+        _log.warning("in no pair, so without a pose: %d of %d images, %s", len(unused), len(images), listing(unused))
     return Inputs(
         images={name: file for name, file in images.items() if name in used},
         cameras=imported.cameras,
@@ -145,8 +146,10 @@ def _tell_of_masks(mask_path: Path, without: Sequence[str], num_images: int) -> 
     hint = f"; '{named_otherwise.name}' is there, and must be renamed" if named_otherwise.exists() else ""
     expected = f"COLMAP's name for the mask of '{name}' is '{name}.png'{hint}"
     if len(without) == num_images:
-        raise InputError(f"--mask-path '{mask_path}' holds no mask of the {num_images} images; {expected}")
-    _log.warning("%d of %d images have no mask in '%s': %s", len(without), num_images, mask_path, expected)
+        raise InputError(
+            f"--mask-path '{mask_path}' holds no mask of any of {counted(num_images, 'image')}; {expected}"
+        )
+    _log.warning("no mask in '%s' for %d of %d images; %s", mask_path, len(without), num_images, expected)
 
 
 def _check_existing(database: Path, images: Mapping[str, ImageFile], cameras: Mapping[str, CameraInfo]) -> None:

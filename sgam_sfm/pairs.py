@@ -81,7 +81,7 @@ def read_pairs(path: Path, names: Sequence[str], unreadable: Collection[str] = (
             target[pair] = None
     if faults:
         others = ", ".join(map(str, faults[1 : 1 + _MAX_FAULTS])) + (", ..." if len(faults) > 1 + _MAX_FAULTS else "")
-        more = f" ({len(faults) - 1} more lines cannot be used: {others})" if others else ""
+        more = f" ({counted(len(faults) - 1, 'other line')} cannot be used: {others})" if others else ""
         raise InputError(f"{path}, line {faults[0]}: {fault}{more}")
     if not pairs and not set_aside:
         raise InputError(f"{path} names no pair of two different images; expected lines of the form 'a.jpg b.jpg'")

@@ -167,12 +167,14 @@ def test_masks_that_are_missing_named_otherwise_or_of_another_size_are_told_at_o
     given = arguments(folder, output, "--area-matcher", "none", "--no-mapping", "--mask-path", str(masks))
     assert cli.run(given) == ERROR
     error = capsys.readouterr().err
-    assert f"--mask-path '{masks}' holds no mask of the 6 images; COLMAP's name for the mask of '{a}.jpg' is" in error
+    assert (
+        f"--mask-path '{masks}' holds no mask of any of 6 images; COLMAP's name for the mask of '{a}.jpg' is" in error
+    )
     assert f"'{a}.jpg.png'; '{a}.png' is there, and must be renamed" in error
     shutil.copy(masks / f"{a}.png", masks / f"{b}.jpg.png")
     PIL.Image.new("L", (48, 64), 255).save(masks / f"{c}.jpg.png")
     assert cli.run(given) == SOME_FAILED
-    assert "4 of 5 images have no mask in" in " ".join(capsys.readouterr().err.split())
+    assert "for 4 of 5 images; COLMAP's name for the mask of" in " ".join(capsys.readouterr().err.split())
     summary = summary_of(output)
     assert summary["images"]["failed"].keys() == {f"{c}.jpg"}
     assert f"mask of '{c}.jpg' is 64x48 but the image is 480x640" in summary["images"]["failed"][f"{c}.jpg"]
@@ -188,7 +190,7 @@ def test_images_that_get_no_pose_are_named(room, folder, tmp_path, capsys):
     changes = ["--area-matcher", "none", "--mask-path", str(masks), "--pairs", str(pairs)]
     assert cli.run(arguments(folder, output, *changes)) == DONE
     told = " ".join(capsys.readouterr().err.split())
-    assert f"2 of 6 images are in no pair, and get no pose: '{d}', '{e}'" in told
+    assert f"in no pair, so without a pose: 2 of 6 images, '{d}', '{e}'" in told
     assert f"no pose '{d}', '{e}', '{f}'" in told
     assert summary_of(output)["without_pose"] == [d, e, f]
     assert cli.run(["status", str(output)]) == DONE

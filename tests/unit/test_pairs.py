@@ -87,7 +87,7 @@ def test_what_is_wrong_with_a_line_is_told(pair_file, line, fault):
 
 def test_all_lines_with_a_fault_are_told_of(pair_file):
     path = pair_file("a.jpg x\na.jpg b.jpg\n" + "y b.jpg\n" * 7)
-    told = r", line 1: 'x' is not among .* \(7 more lines cannot be used: 3, 4, 5, 6, 7, \.\.\.\)$"
+    told = r", line 1: 'x' is not among .* \(7 other lines cannot be used: 3, 4, 5, 6, 7, \.\.\.\)$"
     with pytest.raises(InputError, match=told):
         read_pairs(path, NAMES)
 
