@@ -168,7 +168,7 @@ def test_masks_that_are_missing_named_otherwise_or_of_another_size_are_told_at_o
     assert cli.run(given) == ERROR
     error = capsys.readouterr().err
     assert (
-        f"--mask-path '{masks}' holds no mask of any of 6 images; COLMAP's name for the mask of '{a}.jpg' is" in error
+        f"--mask-path '{masks}' holds no mask of 6 images; COLMAP's name for the mask of '{a}.jpg' is" in error
     )
     assert f"'{a}.jpg.png'; '{a}.png' is there, and must be renamed" in error
     shutil.copy(masks / f"{a}.png", masks / f"{b}.jpg.png")
