@@ -146,9 +146,7 @@ def _tell_of_masks(mask_path: Path, without: Sequence[str], num_images: int) -> 
     hint = f"; '{named_otherwise.name}' is there, and must be renamed" if named_otherwise.exists() else ""
     expected = f"COLMAP's name for the mask of '{name}' is '{name}.png'{hint}"
     if len(without) == num_images:
-        raise InputError(
-            f"--mask-path '{mask_path}' holds no mask of {counted(num_images, 'image')}; {expected}"
-        )
+        raise InputError(f"--mask-path '{mask_path}' holds no mask of {counted(num_images, 'image')}; {expected}")
     _log.warning("no mask in '%s' for %d of %d images; %s", mask_path, len(without), num_images, expected)
 
 

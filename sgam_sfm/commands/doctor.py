@@ -1,4 +1,4 @@
-"""`sgam-sfm doctor`: what this machine is to a run, and a ten-second self-test."""
+"""`sgam-sfm doctor`: what this machine is to a run, and a short self-test."""
 
 from __future__ import annotations
 

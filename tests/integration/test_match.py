@@ -167,9 +167,7 @@ def test_masks_that_are_missing_named_otherwise_or_of_another_size_are_told_at_o
     given = arguments(folder, output, "--area-matcher", "none", "--no-mapping", "--mask-path", str(masks))
     assert cli.run(given) == ERROR
     error = capsys.readouterr().err
-    assert (
-        f"--mask-path '{masks}' holds no mask of 6 images; COLMAP's name for the mask of '{a}.jpg' is" in error
-    )
+    assert f"--mask-path '{masks}' holds no mask of 6 images; COLMAP's name for the mask of '{a}.jpg' is" in error
     assert f"'{a}.jpg.png'; '{a}.png' is there, and must be renamed" in error
     shutil.copy(masks / f"{a}.png", masks / f"{b}.jpg.png")
     PIL.Image.new("L", (48, 64), 255).save(masks / f"{c}.jpg.png")
