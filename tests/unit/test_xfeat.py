@@ -160,7 +160,7 @@ def test_a_file_that_is_no_xfeat_model(tmp_path):
     torch.save([torch.zeros(3)], tmp_path / "list.pt")
     for name, words in (
         ("other.pt", "does not hold the weights of XFeat: "),
-        ("text.pt", "cannot be loaded as XFeat weights: it is no file of tensors"),
+        ("text.pt", "cannot be loaded as XFeat weights: it is damaged, or holds more than"),
         ("list.pt", "holds no state dict of XFeat but a list"),
     ):
         with pytest.raises(WeightsError) as error:
