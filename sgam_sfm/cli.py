@@ -28,7 +28,7 @@ from sgam_sfm.evaluation.options import EvaluateOptions
 from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED, MEANINGS, USAGE
 from sgam_sfm.files import disk_is_full
 from sgam_sfm.machine import out_of_memory
-from sgam_sfm.nearest import did_you_mean
+from sgam_sfm.nearest import unknown
 from sgam_sfm.options import MatchOptions, SegmentOptions, starting_options
 from sgam_sfm.pair_lists.options import PairsOptions
 from sgam_sfm.stage_options import AggregateOptions, ExportOptions, JoinOptions, LocalizeOptions, ReconstructOptions
@@ -129,7 +129,7 @@ def _path_or_none(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructor
 
 def _parse_command(name: str, arguments: Sequence[str], known: Mapping[str, type]) -> Any:
     if name not in known:
-        raise OptionError(f"command '{name}' is unknown; {did_you_mean(name, known)}known: {', '.join(known)}")
+        raise OptionError(unknown("command", name, known))
     options: Any = known[name]
     default = _defaults(arguments, options) if issubclass(options, MatchOptions) else None
     given = {} if default is None else {"default": default}

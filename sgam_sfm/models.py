@@ -19,7 +19,7 @@ from sgam_core.errors import OptionError, WeightsError
 from sgam_sfm import registry
 from sgam_sfm.hub import download, in_cache
 from sgam_sfm.matchers.vismatch import environment, how_to_make, python_of
-from sgam_sfm.nearest import did_you_mean
+from sgam_sfm.nearest import unknown
 from sgam_sfm.weights import (
     ADE20K,
     ALIKED,
@@ -180,8 +180,7 @@ def get_weights(name: str, source: Path | None = None, accepted: str = "") -> tu
     """
     cards = {card.name: card for card in CARDS}
     if name not in cards:
-        hint = did_you_mean(name, cards)
-        raise OptionError(f"model '{name}' is unknown; {hint}known: {', '.join(cards)}")
+        raise OptionError(unknown("model", name, cards))
     card = cards[name]
     if card.hub and source is not None:
         raise OptionError(f"model '{name}' takes a folder as it is: no --from, but `--weights {source}` when it runs")

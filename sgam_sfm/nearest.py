@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """`did you mean 'x'? ` with the nearest of the known names; empty when none is near."""
-    near = difflib.get_close_matches(name, list(known), n=1)
-    return f"did you mean '{near[0]}'? " if near else ""
+    """`did you mean 'x'? ` with the nearest of the known names, in whatever case; empty when none is near."""
+    by_folded = {other.casefold(): other for other in known}
+    near = difflib.get_close_matches(name.casefold(), by_folded, n=1)
+    return f"did you mean '{by_folded[near[0]]}'? " if near else ""
+
+
+def unknown(what: str, name: str, known: Collection[str]) -> str:
+    """What is said of a name that is none of a few."""
+    return f"{what} '{name}' is unknown; {did_you_mean(name, known)}known: {', '.join(known)}"
 
 
 def listing(names: Sequence[str], most: int = 8) -> str:

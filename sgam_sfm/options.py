@@ -33,6 +33,7 @@ from sgam_core.options import (
 )
 from sgam_sfm.machine import Precision
 from sgam_sfm.merging.keypoints import KeypointOptions
+from sgam_sfm.nearest import unknown
 from sgam_sfm.runs.shards import Shard
 
 Preset = Literal["default", "fast", "paper", "scannet", "outdoor"]
@@ -300,7 +301,7 @@ def with_preset(options: MatchOptions, preset: str) -> MatchOptions:
     Raises: OptionError for an unknown preset.
     """
     if preset not in PRESETS:
-        raise OptionError(f"preset '{preset}' is unknown; known: {', '.join(PRESETS)}")
+        raise OptionError(unknown("preset", preset, PRESETS))
     stages = {stage: getattr(PRESETS[preset], stage) for stage in _STAGES}
     return replace(options, preset=cast(Preset, preset), **stages)
 

@@ -14,6 +14,8 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 
+from sgam_sfm.nearest import unknown
+
 CAMERA_MODELS = tuple(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
 
 
@@ -48,7 +50,7 @@ class CameraInfo:
 def camera_parameters(model: str, params: str | Sequence[float | str] | None) -> tuple[float, ...] | None:
     """The parameters as numbers. Raises: ValueError, with a message for users, when they do not fit the model."""
     if model not in CAMERA_MODELS:
-        raise ValueError(f"camera model '{model}' is unknown; choose one of {', '.join(CAMERA_MODELS)}")
+        raise ValueError(unknown("camera model", model, CAMERA_MODELS))
     if params is None:
         return None
     texts = [text for text in params.split(",") if text.strip()] if isinstance(params, str) else list(params)

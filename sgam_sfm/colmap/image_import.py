@@ -15,6 +15,7 @@ from sgam_sfm.colmap.cameras import CameraInfo, KnownCamera, camera_parameters
 from sgam_sfm.colmap.database import backup, replacing_database
 from sgam_sfm.colmap.reading import quiet
 from sgam_sfm.colmap.rigs import Rigs, apply_rigs, read_rigs
+from sgam_sfm.nearest import unknown
 
 CAMERA_MODES = ("auto", "single", "per-folder", "per-image")
 
@@ -41,7 +42,7 @@ class CameraOptions:
         if self.rigs is not None and self.database is not None:
             raise OptionError("--rigs would change the rigs of --database; apply them there with COLMAP, leave one out")
         if self.mode not in CAMERA_MODES:
-            raise OptionError(f"camera mode '{self.mode}' is unknown; choose one of {', '.join(CAMERA_MODES)}")
+            raise OptionError(unknown("camera mode", self.mode, CAMERA_MODES))
         try:
             object.__setattr__(self, "params", camera_parameters(self.model, self.params))
         except ValueError as error:

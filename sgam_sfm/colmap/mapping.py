@@ -16,6 +16,7 @@ from sgam_sfm.colmap.process import Progress, run
 from sgam_sfm.colmap.reading import require_database
 from sgam_sfm.colmap.triangulation import require_fitting
 from sgam_sfm.files import flush
+from sgam_sfm.nearest import unknown
 
 MAPPERS = ("incremental", "global", "hierarchical", "triangulate")
 
@@ -38,7 +39,7 @@ class MappingOptions:
 
     def __post_init__(self) -> None:
         if self.mapper not in MAPPERS:
-            raise OptionError(f"mapper '{self.mapper}' is unknown; choose one of {', '.join(MAPPERS)}")
+            raise OptionError(unknown("mapper", self.mapper, MAPPERS))
         if self.min_model_size < 2:
             raise OptionError(f"min_model_size is {self.min_model_size}; a model has at least 2 images")
 

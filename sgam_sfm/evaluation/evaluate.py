@@ -26,7 +26,7 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import LabelMaps, make_label_maps
 from sgam_sfm.machine import find_device, use_threads
 from sgam_sfm.match_cache import CachedMatcher
-from sgam_sfm.nearest import did_you_mean
+from sgam_sfm.nearest import unknown
 from sgam_sfm.options import MatchOptions, told_options
 from sgam_sfm.pairs import Pair, spread_over, write_pairs
 from sgam_sfm.progress import Stages
@@ -182,8 +182,7 @@ def with_dataset(options: EvaluateOptions) -> EvaluateOptions:
     if not options.dataset:
         return options
     if options.dataset not in PRESETS:
-        hint = did_you_mean(options.dataset, PRESETS)
-        raise OptionError(f"--dataset '{options.dataset}' is unknown; {hint}known: {', '.join(PRESETS)}")
+        raise OptionError(unknown("--dataset", options.dataset, PRESETS))
     preset = PRESETS[options.dataset]
     return replace(
         options,

@@ -170,7 +170,7 @@ def test_cameras_of_a_colmap_model(tmp_path, folder, caplog):
     ("line", "message"),
     [
         ("a.jpg PINHOLE 64 48 50 50 32", "has 4 parameters (fx, fy, cx, cy) but 3 were given: '50,50,32'"),
-        ("a.jpg PINHOL 64 48 50 50 32 24", "camera model 'PINHOL' is unknown; choose one of SIMPLE_PINHOLE, PINHOLE,"),
+        ("a.jpg PINHOL 64 48 50 50 32 24", "camera model 'PINHOL' is unknown; did you mean 'PINHOLE'? known: "),
         ("a.jpg PINHOLE 64 48 50 x 32 24", "are not all numbers"),
         ("a.jpg PINHOLE 64", "line 2: expected 'name MODEL width height params...'"),
         ("* PINHOLE 64 48 50 50 32 24", "line 2: '*' has a camera already"),
@@ -210,8 +210,8 @@ def test_known_camera_of_another_size(tmp_path, folder, name):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"mode": "folder"}, "camera mode 'folder' is unknown; choose one of auto, single, per-folder, per-image"),
-        ({"model": "pinhole"}, "camera model 'pinhole' is unknown; choose one of SIMPLE_PINHOLE, PINHOLE,"),
+        ({"mode": "folder"}, "camera mode 'folder' is unknown; did you mean 'per-folder'? known: auto, single,"),
+        ({"model": "pinhole"}, "camera model 'pinhole' is unknown; did you mean 'PINHOLE'? known: SIMPLE_PINHOLE,"),
         (
             {"params": "50,32,24"},
             "camera model SIMPLE_RADIAL has 4 parameters (f, cx, cy, k) but 3 were given: '50,32,24'",

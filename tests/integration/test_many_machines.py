@@ -128,7 +128,7 @@ def test_a_shard_says_what_it_did_and_ends_well(folder, tmp_path, capsys):
     command = [*flags(given(folder, output, images=images, matcher="sift")), "--shard", "6/6"]
     assert cli.run(command) == DONE  # though an image failed: a scheduler is to go on to `join`, which ends with 3
     table = capsys.readouterr().err
-    assert "6/6, 1 blocks of pairs" in table
+    assert "6/6, 1 block of pairs" in table
     assert "1 of 6 matched, 0 failed" in table
     assert "once all shards are done: sgam-sfm join SHARD_OUT... --output OUT" in table
     assert cli.run(["status", str(output)]) == DONE

@@ -32,7 +32,7 @@ def written(tmp_path: Path, content: object, name: str = "c.json") -> Path:
             {"mapper": "colmap"},
             "option 'mapper' is 'colmap': Input should be 'incremental', 'global' or 'hierarchical'",
         ),
-        ({"preset": "papr"}, "preset 'papr' is unknown; known: default, fast, paper"),
+        ({"preset": "papr"}, "preset 'papr' is unknown; did you mean 'paper'? known: default, fast, paper"),
         ([1, 2], "holds a list; expected options by name"),
         ("{", "cannot be used ("),
     ],

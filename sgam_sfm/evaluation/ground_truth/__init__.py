@@ -19,7 +19,7 @@ from sgam_sfm.evaluation.ground_truth import (
     yfcc100m,
 )
 from sgam_sfm.evaluation.ground_truth.types import Format, GroundTruth, TrueView
-from sgam_sfm.nearest import did_you_mean
+from sgam_sfm.nearest import unknown
 
 __all__ = ["FORMATS", "Format", "GroundTruth", "TrueView", "read_ground_truth"]
 
@@ -50,8 +50,7 @@ def read_ground_truth(path: Path, format: str | None = None, images: Path | None
         format.
     """
     if format is not None and format not in FORMATS:
-        hint = did_you_mean(format, FORMATS)
-        raise OptionError(f"ground-truth format '{format}' is unknown; {hint}known: {', '.join(FORMATS)}")
+        raise OptionError(unknown("ground-truth format", format, FORMATS))
     if not path.exists():
         raise InputError(f"there is no ground truth at '{path}'; give a file or folder")
     chosen = FORMATS[format] if format else next((found for found in FORMATS.values() if found.detects(path)), None)
