@@ -86,7 +86,7 @@ def run(arguments: Sequence[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except Exception as error:
-        message, code = _explained(error, getattr(options, "output", None))
+        message, code = _explained(error, getattr(getattr(options, "method", options), "output", None))
         console.print(f"[red]error:[/red] {escape(message)}", highlight=False, soft_wrap=True)
         return code
     except KeyboardInterrupt:
@@ -111,11 +111,12 @@ def _parse(arguments: Sequence[str]) -> Any:
 
 
 _HELP = tyro.constructors.ConstructorRegistry()
+_NOT_GIVEN = ["not", "given"]
 
 
 @_HELP.primitive_rule
 def _path_or_none(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
-    """`PATH` in the help, in place of `{None}|PATH`."""
+    """`PATH (default: not given)` in the help, in place of `{None}|PATH (default: None)`."""
     if info.type != Path | None:
         return None
     return tyro.constructors.PrimitiveConstructorSpec(
@@ -123,7 +124,21 @@ def _path_or_none(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructor
         metavar="PATH",
         instance_from_str=lambda texts: None if texts[0] == "None" else Path(texts[0]),
         is_instance=lambda value: value is None or isinstance(value, Path),
-        str_from_instance=lambda value: [str(value)],
+        str_from_instance=lambda value: [str(value)] if value is not None else _NOT_GIVEN,
+    )
+
+
+@_HELP.primitive_rule
+def _text(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
+    """`TEXT (default: not given)` in the help, in place of `STR (default: '')`."""
+    if info.type is not str:
+        return None
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="TEXT",
+        instance_from_str=lambda texts: texts[0],
+        is_instance=lambda value: isinstance(value, str),
+        str_from_instance=lambda value: [value] if value else _NOT_GIVEN,
     )
 
 

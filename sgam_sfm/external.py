@@ -23,7 +23,7 @@ from typing import IO, Any, TypeVar
 
 import numpy as np
 
-from sgam_core.errors import OptionError, SGAMError, StageError
+from sgam_core.errors import InputError, OptionError, SGAMError, StageError
 from sgam_sfm.options import MatchOptions, SegmentOptions
 from sgam_sfm.workers import sgam_worker
 from sgam_sfm.workers.sgam_worker import PROTOCOL, ProtocolError, read_message, write_message
@@ -78,7 +78,7 @@ class WorkerCommand:
     def line(self) -> list[str]:
         """The command line.
 
-        Raises: OptionError when Python or script is missing, or the time-out is none.
+        Raises: OptionError when none is named, or the time-out is none; InputError when Python or script is missing.
         """
         python, script = self.python or Path(sys.executable), self.script
         if script is None:
@@ -92,7 +92,7 @@ class WorkerCommand:
         ):
             if not path.is_file():
                 state = "is a folder" if path.is_dir() else "does not exist"
-                raise OptionError(f"--{self.kind}-{option} '{path}' {state}; give {wanted}")
+                raise InputError(f"--{self.kind}-{option} '{path}' {state}; give {wanted}")
         if not self.timeout > 0:
             raise OptionError(f"--worker-timeout is {self.timeout:g}; expected more than 0 seconds")
         return [str(python.absolute()), sgam_worker.__file__, str(script.absolute()), *self.arguments]

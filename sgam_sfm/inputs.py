@@ -15,7 +15,7 @@ from sgam_sfm.colmap.image_import import CameraOptions, import_cameras
 from sgam_sfm.images import MAX_IMAGE_SIZE, ImageFile, image_format, inspect_image, list_images, printable, read_mask
 from sgam_sfm.nearest import listing
 from sgam_sfm.options import MatchOptions
-from sgam_sfm.pairs import PairList, all_pairs, read_pairs, require_pair_list
+from sgam_sfm.pairs import PairList, all_pairs, read_pairs, set_aside
 from sgam_sfm.progress import Stages
 
 _log = logging.getLogger(__name__)
@@ -58,8 +58,10 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
         rigs=options.rigs,
         database=options.database,
     )
-    if options.pairs is not None:
-        require_pair_list(options.pairs)
+    listed = None
+    if options.pairs is not None:  # before the images are decoded, which takes longer
+        names, _ = list_images(options.images)
+        listed = read_pairs(options.pairs, tuple(map(printable, names)))
     found = read_images(options.images, options.output, stages, options.max_image_size, options.mask_path)
     images, failed = found.images, found.failed
     num_listed = len(images) + len(failed)
@@ -78,10 +80,7 @@ def read_inputs(options: MatchOptions, stages: Stages) -> Inputs:
     if same:
         _log.warning("%d images have the same content as another, such as '%s' and '%s'", len(same), *same[:2])
     _check_any(images, failed, options.images)
-    if options.pairs is None:
-        pairs = PairList(pairs=all_pairs(tuple(images)))
-    else:
-        pairs = read_pairs(options.pairs, tuple(images), tuple(failed))
+    pairs = set_aside(listed, failed) if listed else PairList(pairs=all_pairs(tuple(images)))
     if not pairs.pairs:
         why = "each listed pair names another one" if options.pairs else "a pair needs two"
         raise InputError(

@@ -48,7 +48,12 @@ def runs_half(precision: Precision, device: torch.device) -> bool:
 
 
 def use_threads(number: int) -> None:
-    """Let torch and OpenCV use this many CPU threads (0: as many as they would by themselves)."""
+    """Let torch and OpenCV use this many CPU threads (0: as many as they would by themselves).
+
+    Raises: OptionError for less than none.
+    """
+    if number < 0:
+        raise OptionError(f"--threads is {number}; expected a number of cores, or 0 for all")
     import cv2
     import torch
 

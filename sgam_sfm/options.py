@@ -184,6 +184,9 @@ class MatchOptions:
     """Merging the points of all pairs into keypoints."""
 
     def __post_init__(self) -> None:
+        for name in ("max_image_size", "block_images"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"--{name.replace('_', '-')} is {getattr(self, name)}; expected at least 1")
         if self.shard:
             Shard.parse(self.shard)
 

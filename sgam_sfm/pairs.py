@@ -9,7 +9,7 @@ import re
 import unicodedata
 from array import array
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -55,14 +55,12 @@ def read_pairs(path: Path, names: Sequence[str], unreadable: Collection[str] = (
         aside rather than refused.
     Raises: InputError when the file cannot be read, a line does not name two known images, or no pair is left.
     """
-    broken = set(unreadable)
-    known = {name: name for name in (*names, *broken)}  # pairs share their names: lists of millions stay small
+    known = {name: name for name in (*names, *unreadable)}  # pairs share their names: lists of millions stay small
     pairs: dict[Pair, None] = {}
-    set_aside: dict[Pair, None] = {}
     num_repeated = num_reversed = num_self = 0
     faults, fault = array("q"), ""
     for number, line in _lines(path):
-        if (pairs or set_aside or num_self) and _is_match(line, known):
+        if (pairs or num_self) and _is_match(line, known):
             continue
         pair = _pair(line, known)
         if pair is None:
@@ -70,33 +68,31 @@ def read_pairs(path: Path, names: Sequence[str], unreadable: Collection[str] = (
             fault = fault or _fault(line, known)
             continue
         name0, name1 = pair
-        target = set_aside if broken.intersection(pair) else pairs
         if name0 == name1:
             num_self += 1
-        elif pair in target:
+        elif pair in pairs:
             num_repeated += 1
-        elif (name1, name0) in target:
+        elif (name1, name0) in pairs:
             num_reversed += 1
         else:
-            target[pair] = None
+            pairs[pair] = None
     if faults:
         others = ", ".join(map(str, faults[1 : 1 + _MAX_FAULTS])) + (", ..." if len(faults) > 1 + _MAX_FAULTS else "")
         more = f" ({counted(len(faults) - 1, 'other line')} cannot be used: {others})" if others else ""
         raise InputError(f"{path}, line {faults[0]}: {fault}{more}")
-    if not pairs and not set_aside:
+    if not pairs:
         raise InputError(f"{path} names no pair of two different images; expected lines of the form 'a.jpg b.jpg'")
-    return PairList(
-        pairs=tuple(pairs),
-        unreadable=tuple(set_aside),
-        num_repeated=num_repeated,
-        num_reversed=num_reversed,
-        num_self=num_self,
+    listed = PairList(pairs=tuple(pairs), num_repeated=num_repeated, num_reversed=num_reversed, num_self=num_self)
+    return set_aside(listed, unreadable)
+
+
+def set_aside(listed: PairList, unreadable: Collection[str]) -> PairList:
+    """The list with the pairs of images that cannot be read apart from the others."""
+    broken = set(unreadable)
+    apart = tuple(pair for pair in listed.pairs if broken.intersection(pair))
+    return replace(
+        listed, pairs=tuple(pair for pair in listed.pairs if not broken.intersection(pair)), unreadable=apart
     )
-
-
-def require_pair_list(path: Path) -> None:
-    """Raises: InputError when the file cannot be read, or does not begin as text."""
-    next(_lines(path), None)
 
 
 def write_pairs(path: Path, pairs: Iterable[Pair]) -> None:

@@ -14,11 +14,13 @@ _MAX_LISTED = 32
 def run(options: SegmentOptions, console: Console) -> int:
     """Segment; say what was found."""
     from sgam_sfm.external import refuse_unused_script
+    from sgam_sfm.inputs import refuse_among_images
     from sgam_sfm.progress import Stages
     from sgam_sfm.segmentation import segment_collection
 
     refuse_unused_script(options, "segmenter")
-    with logging_to(None, console, verbose=options.verbose):
+    refuse_among_images(options.output, options.images)  # before the log is begun there
+    with logging_to(options.output / "log.txt", console, verbose=options.verbose):
         found = segment_collection(options, Stages(console=console))
     console.print(f"labels     {len(found.labels)}, made by {found.segmenter}: id, name, share of all pixels")
     for label in sorted(found.labels, key=lambda label: -label.share)[:_MAX_LISTED]:

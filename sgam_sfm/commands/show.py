@@ -23,7 +23,9 @@ class ShowOptions:
 
     output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     """Result folder of a run, finished or not."""
-    names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME [NAME]]")] = ()
+    names: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME [NAME]]", help_behavior_hint="")
+    ] = ()
     """No, one or two image names, as in the pair list."""
     save: Path | None = None
     """File of the picture: png, jpg, webp, tif, pdf or svg. Without it: a png in OUT/pictures."""

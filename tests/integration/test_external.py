@@ -12,7 +12,7 @@ import PIL.Image
 import psutil
 import pytest
 
-from sgam_core.errors import OptionError, StageError
+from sgam_core.errors import InputError, OptionError, StageError
 from sgam_core.types import Crop
 from sgam_sfm import cli
 from sgam_sfm.exit_codes import DONE, ERROR, USAGE
@@ -76,7 +76,7 @@ PAIR = (crop(), crop(20, 50, "other"))
 
 
 def rejected(script: Path | None, **changes: object) -> str:
-    with pytest.raises((OptionError, StageError)) as error:
+    with pytest.raises((InputError, OptionError, StageError)) as error:
         ExternalMatcher(worker=command(script, **changes))
     return str(error.value)
 

@@ -210,6 +210,9 @@ ONE_LINE_ERRORS = {
     "camera": (["--camera-params", "1,2"], "camera model SIMPLE_RADIAL has 4 parameters"),
     "masks": (["--mask-path", "{tmp}/masks"], "--mask-path '{tmp}/masks' does not exist"),
     "labels": (["--labels", "{tmp}/labels"], "--labels '{tmp}/labels' does not exist"),
+    "block images": (["--block-images", "0"], "--block-images is 0; expected at least 1"),
+    "image size": (["--max-image-size", "-5"], "--max-image-size is -5; expected at least 1"),
+    "threads": (["--threads", "-1"], "--threads is -1; expected a number of cores, or 0 for all"),
     "config": (["--config", "{tmp}/c.toml"], "--config '{tmp}/c.toml' does not exist"),
     "a label's name": (
         ["--mask-matches", "sky"],

@@ -182,7 +182,10 @@ def test_a_damaged_labels_json_is_named(folder, tmp_path, capsys):
     maps = tmp_path / "labels"
     shutil.copytree(folder / "labels", maps)
     (maps / "labels.json").write_text('{"labels": [{"name": "wall"}]}')
-    assert cli.run(["segment", "--images", str(folder / "images"), "--labels", str(maps), "--output", "x"]) == ERROR
+    assert (
+        cli.run(["segment", "--images", str(folder / "images"), "--labels", str(maps), "--output", str(tmp_path / "x")])
+        == ERROR
+    )
     assert f"'{maps}/labels.json' cannot be used (labels.0.id: Field required)" in capsys.readouterr().err
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from sgam_sfm import cli
 from sgam_sfm.colmap.reading import database_content
-from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED
+from sgam_sfm.exit_codes import DONE, ERROR, INTERRUPTED, USAGE
 from tests.room import Room, write_room
 
 # Presses Ctrl-C, which reaches the process and its children alike, once the stage has lasted for a while.
@@ -113,6 +113,12 @@ def test_an_output_that_cannot_be_made_is_one_line(folder, capsys):
     assert cli.run(arguments(folder, Path("/proc/out"))) == ERROR
     told = "error: '/proc/out' cannot be made (No such file or directory: '/proc/out'); choose another --output"
     assert told in capsys.readouterr().err
+    assert (
+        cli.run(["pairs", "exhaustive", "--images", str(folder / "images"), "--output", "/proc/out/pairs.txt"]) == ERROR
+    )
+    assert "'/proc/out/pairs.txt' cannot be made" in capsys.readouterr().err
+    assert cli.run(["segment", "--images", str(folder / "images"), "--output", "/proc/out"]) == ERROR
+    assert told in capsys.readouterr().err
 
 
 def test_a_folder_that_may_not_be_written_is_one_line(folder, small_disk, capsys):
@@ -147,3 +153,13 @@ def test_status_of_a_run_that_did_not_begin_names_no_command_that_goes_on(tmp_pa
     status = capsys.readouterr().out
     assert status.startswith("state      failed")
     assert "next" not in status
+
+
+@pytest.mark.parametrize(
+    "wrong", [["--pairs", "PAIRS"], ["--camera-model", "PINHOL"], ["--device", "cud"], ["--labels", "nowhere"]]
+)
+def test_wrong_options_are_told_before_images_are_read(folder, tmp_path, wrong, capsys):
+    (tmp_path / "pairs.txt").write_text("no.jpg other.jpg\n")
+    wrong = [word.replace("PAIRS", str(tmp_path / "pairs.txt")) for word in wrong]
+    assert cli.run([*arguments(folder, tmp_path / "out"), *wrong]) in (ERROR, USAGE)
+    assert "Reading images" not in capsys.readouterr().err

@@ -33,3 +33,8 @@ def test_half_precision_is_for_cuda(precision, device, expected):
 def test_half_precision_on_the_cpu_is_refused():
     with pytest.raises(OptionError, match=r"^--precision half: on the CPU networks take .* leave it out, or give "):
         runs_half("half", torch.device("cpu"))
+
+
+def test_less_than_no_thread_is_refused():
+    with pytest.raises(OptionError, match=r"^--threads is -1; expected a number of cores, or 0 for all$"):
+        use_threads(-1)

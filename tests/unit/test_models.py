@@ -330,6 +330,13 @@ def test_other_weights_are_refused_and_leave_nothing(tmp_path, toy, cache):
     assert not list(cache.iterdir())
 
 
+def test_a_segmenter_takes_no_weights_of_ones_own(tmp_path, cache):
+    other = tmp_path / "other"
+    other.write_bytes(CONTENT)
+    with pytest.raises(WeightsError, match=rf"^'{other}' is not the ADE20K file: it has \d+ bytes; expected 2348952$"):
+        get_weights("ade20k", other)
+
+
 def test_weights_without_a_checksum_must_fit_their_model(tmp_path, cache):
     (tmp_path / "outdoor.ckpt").write_bytes(b"not a checkpoint")
     with pytest.raises(WeightsError):
