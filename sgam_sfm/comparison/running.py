@@ -24,12 +24,12 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.logs import logging_to
 from sgam_sfm.match_cache import CachedMatcher
-from sgam_sfm.options import MatchOptions, fingerprint
+from sgam_sfm.options import MatchOptions
 from sgam_sfm.progress import Stages
 from sgam_sfm.runs.matching import CollectionMatcher, create_area_matcher
 from sgam_sfm.runs.results import json_object
 from sgam_sfm.runs.run_record import recording
-from sgam_sfm.runs.runner import match_collection, reconstruct
+from sgam_sfm.runs.runner import fingerprint_of, match_collection, reconstruct
 from sgam_sfm.runs.summary import summarise_models
 
 _log = logging.getLogger(__name__)
@@ -107,8 +107,7 @@ def _run_matcher(job: Job, stages: Stages) -> dict[str, Any]:
 def _forget_interrupted(options: MatchOptions, inputs: Inputs) -> None:
     """Match from the start what was interrupted: the point matcher's results are kept, with what they cost."""
     begun = json_object(options.output / "options.json").get("fingerprint")
-    mark = fingerprint(options, images=inputs.digests, pairs=inputs.pairs.pairs, cameras=inputs.cameras)
-    if begun == mark and not (options.output / "result.json").exists():
+    if begun == fingerprint_of(options, inputs) and not (options.output / "result.json").exists():
         shutil.rmtree(options.output / "pairs", ignore_errors=True)
 
 

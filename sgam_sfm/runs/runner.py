@@ -187,13 +187,18 @@ def _summarise_labels(job: MatchingJob) -> dict[str, Any]:
     return {} if job.labels is None else {"failed": job.labels.set.failed, **job.labels.set.facts}
 
 
+def fingerprint_of(options: MatchOptions, inputs: Inputs) -> str:
+    """Of all that the raw results of a run follow from, as its options.json has it."""
+    return fingerprint(options, images=inputs.digests, pairs=inputs.pairs.pairs, cameras=inputs.cameras)
+
+
 def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
     """The store of raw results in OUT, bound to options and inputs, which are written to OUT as JSON.
 
     An options.json that the disk has damaged is written anew: every block knows its own fingerprint.
     Raises: OptionError when OUT was begun with others, naming them, or holds another shard.
     """
-    mark = fingerprint(options, images=inputs.digests, pairs=inputs.pairs.pairs, cameras=inputs.cameras)
+    mark = fingerprint_of(options, inputs)
     path = options.output / "options.json"
     now, known = as_json(options) | {"fingerprint": mark}, _as_json(inputs)
     if path.exists():
