@@ -62,7 +62,8 @@ def estimate_two_view(
     usac = cv2.UsacParams()
     usac.threshold = options.threshold * float(np.median(matches.sigmas))
     usac.confidence = 0.9999
-    usac.maxIterations = options.max_iterations
+    calibrated = camera0 is not None and camera1 is not None
+    usac.maxIterations = options.max_iterations_calibrated if calibrated else options.max_iterations
     usac.score = cv2.SCORE_METHOD_MAGSAC
     usac.loMethod = cv2.LOCAL_OPTIM_SIGMA
     usac.randomGeneratorState = options.seed
@@ -81,7 +82,7 @@ def estimate_two_view(
     inlier = residuals(F, matches) <= options.max_residual
     return TwoViewModel(
         F=F,
-        calibrated=camera0 is not None and camera1 is not None,
+        calibrated=calibrated,
         num_inliers=int(inlier.sum()),
         num_matches=len(matches),
         planarity=_planarity(matches.select(inlier), usac.threshold),

@@ -2,7 +2,8 @@
 
 Point matchers see through neither quarter turns nor large changes of size. Where two whole images do not agree, they
 are seen small with the second one turned, then with one of them made smaller. The look that finds clearly more stays,
-and all that follows begins with its matches.
+and all that follows begins with its matches. Most images that do not agree show different things: a glance at half the
+size of a look, whose matches are only counted, spares them the look itself.
 """
 
 from __future__ import annotations
@@ -28,27 +29,40 @@ class Look:
         """Size of the second image over that of the first one."""
         return self.sizes[1] / self.sizes[0]
 
+    @property
+    def glance(self) -> Look:
+        """The same at half the size."""
+        size0, size1 = (max(round(size / 2), 1) for size in self.sizes)
+        return replace(self, sizes=(size0, size1))
+
+
+Counts = Callable[[Sequence[Look]], Sequence[int]]
+Models = Callable[[Sequence[Look]], Sequence[TwoViewModel | None]]
+
 
 def best_look(
     plain: Look,
-    models: Callable[[Sequence[Look]], Sequence[TwoViewModel | None]],
+    counts: Counts,
+    models: Models,
     turning: TurningOptions,
     zoom: ZoomOptions,
     guidance: GuidanceOptions,
 ) -> Look:
     """The look at which whole images agree clearly better than at the plain one, which it is where there is none.
 
-    Args: models: the geometry of the whole images at each look. guidance: says when they agree.
+    Args: counts, models: matches of the whole images at each look, and their geometry. guidance: says when they agree.
     """
     look = plain
     if turning.enabled and not agree(models([look])[0], guidance.sure_matches, guidance):
         upright, *turned = (Look(sizes=(turning.image_size, turning.image_size), turns=turns) for turns in range(4))
+        turned = _promising(turned, look, counts, turning)
         if (best := _clearly_best(turned, upright, models, turning)) is not None:
             look = replace(plain, turns=best.turns)
     if zoom.enabled and not agree(models([look])[0], zoom.sure_matches, guidance):
         large0, large1 = look.sizes
         small0, small1 = (max(round(side / zoom.factor), 1) for side in look.sizes)
         smaller = [replace(look, sizes=sizes) for sizes in ((small0, large1), (large0, small1))]
+        smaller = _promising(smaller, look, counts, zoom)
         look = _clearly_best(smaller, look, models, zoom) or look
     return look
 
@@ -60,13 +74,22 @@ def agree(model: TwoViewModel | None, sure_matches: int, guidance: GuidanceOptio
     return model.num_inliers >= sure_matches and model.inlier_ratio >= guidance.sure_inlier_ratio
 
 
+def _promising(
+    looks: Sequence[Look], unchanged: Look, counts: Counts, options: TurningOptions | ZoomOptions
+) -> list[Look]:
+    """The looks at which a glance finds enough matches, against those of the images unchanged."""
+    if not options.min_glance:
+        return list(looks)
+    least = options.min_glance * counts([unchanged])[0]
+    return [look for look, count in zip(looks, counts([look.glance for look in looks]), strict=True) if count >= least]
+
+
 def _clearly_best(
-    looks: Sequence[Look],
-    unchanged: Look,
-    models: Callable[[Sequence[Look]], Sequence[TwoViewModel | None]],
-    options: TurningOptions | ZoomOptions,
+    looks: Sequence[Look], unchanged: Look, models: Models, options: TurningOptions | ZoomOptions
 ) -> Look | None:
     """The look with most inliers, where they are enough against those of the images unchanged; None where not."""
+    if not looks:
+        return None
     found = _inliers(models(looks))
     best = int(np.argmax(found))
     if found[best] < options.min_inliers:  # of most pairs: the images unchanged need not be matched at this size

@@ -56,6 +56,11 @@ class PairPoints:
         """The geometry of the whole images."""
         return self.models([self.look], estimate)[0]
 
+    def counts(self, looks: Sequence[Look]) -> list[int]:
+        """How many matches the whole images have, seen in several ways."""
+        self._see(looks)
+        return [len(self._seen[look]) for look in looks]
+
     def models(self, looks: Sequence[Look], estimate: Estimate) -> list[TwoViewModel | None]:
         """The geometry of the whole images, seen in several ways."""
         self._see(looks)

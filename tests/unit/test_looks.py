@@ -84,11 +84,17 @@ def test_a_learned_matcher_finds_sideways_what_it_finds_upright(room):
 PLAIN = Look(sizes=(900, 600))
 FAR, NEAR = Look(sizes=(300, 600)), Look(sizes=(900, 200))
 SMALL = [Look(sizes=(512, 512), turns=turns) for turns in range(4)]
+PLAIN_MATCHES = 200
 
 
-def chosen(found: dict[Look, int], **zoom) -> tuple[Look, list[Look]]:
-    """The best look where those of `found` have so many inliers and others none, and all looks that were asked for."""
+def chosen(found: dict[Look, int], glances: dict[Look, int] | None = None, **zoom) -> tuple[Look, list[Look]]:
+    """The best look where those of `found` have so many inliers and others none, and all whose geometry was asked for.
+
+    glances: matches that glances find, where they are not as many as the look's.
+    """
     asked = []
+    seen = {look.glance: count for look, count in found.items()}
+    seen |= {look.glance: count for look, count in (glances or {}).items()} | {PLAIN: PLAIN_MATCHES}
 
     def models(looks):
         asked.extend(look for look in looks if look not in asked)
@@ -99,12 +105,15 @@ def chosen(found: dict[Look, int], **zoom) -> tuple[Look, list[Look]]:
             for look in looks
         ]
 
-    return best_look(PLAIN, models, TurningOptions(), ZoomOptions(**zoom), GuidanceOptions()), asked
+    def counts(looks):
+        return [seen.get(look, 0) for look in looks]
+
+    return best_look(PLAIN, counts, models, TurningOptions(), ZoomOptions(**zoom), GuidanceOptions()), asked
 
 
 def test_images_that_agree_are_looked_at_once():
     assert chosen({PLAIN: 150, NEAR: 1000}) == (PLAIN, [PLAIN])
-    assert chosen({PLAIN: 149, NEAR: 1000}) == (NEAR, [PLAIN, FAR, NEAR])  # so well, sizes alone may be wrong
+    assert chosen({PLAIN: 149, NEAR: 1000}) == (NEAR, [PLAIN, NEAR])  # so well, sizes alone may be wrong
 
 
 def test_the_image_taken_from_near_is_made_smaller():
@@ -123,13 +132,24 @@ def test_a_turned_image_may_be_near_too():
     turned = replace(NEAR, turns=1)
     assert chosen({SMALL[1]: 30, turned: 50})[0] == turned
     upright = replace(PLAIN, turns=1)
-    assert chosen({SMALL[1]: 30, upright: 150}) == (upright, [PLAIN, *SMALL[1:], SMALL[0], upright])
+    assert chosen({SMALL[1]: 30, upright: 150}) == (upright, [PLAIN, SMALL[1], SMALL[0], upright])
 
 
 def test_a_turned_image_must_find_clearly_more():
     assert chosen({SMALL[2]: 30, SMALL[0]: 16})[0] == PLAIN
     assert chosen({SMALL[2]: 30, SMALL[0]: 15})[0] == replace(PLAIN, turns=2)
     assert SMALL[0] not in chosen({SMALL[2]: 24})[1]  # as few as chance finds: nothing to compare with
+
+
+def test_what_a_glance_finds_nothing_in_is_not_looked_at():
+    found = {PLAIN: 20, SMALL[1]: 100, SMALL[2]: 100, NEAR: 100, FAR: 100}
+    few = PLAIN_MATCHES * 0.03
+    glances = {SMALL[1]: few - 1, SMALL[2]: few - 1, NEAR: few - 1, FAR: few}
+    assert chosen(found, glances) == (FAR, [PLAIN, FAR])
+
+
+def test_a_glance_has_half_the_size():
+    assert Look(sizes=(511, 1), turns=3).glance == Look(sizes=(256, 1), turns=3)
 
 
 def test_a_learned_matcher_sees_through_a_change_of_size(room):
