@@ -77,11 +77,18 @@ def agree(model: TwoViewModel | None, sure_matches: int, guidance: GuidanceOptio
 def _promising(
     looks: Sequence[Look], unchanged: Look, counts: Counts, options: TurningOptions | ZoomOptions
 ) -> list[Look]:
-    """The looks at which a glance finds enough matches, against those of the images unchanged."""
+    """The looks at which a glance finds enough matches, for its size, against those of the images unchanged."""
     if not options.min_glance:
         return list(looks)
-    least = options.min_glance * counts([unchanged])[0]
-    return [look for look, count in zip(looks, counts([look.glance for look in looks]), strict=True) if count >= least]
+    glances = [look.glance for look in looks]
+    [least] = _densities([unchanged], counts)
+    found = zip(looks, _densities(glances, counts), strict=True)
+    return [look for look, density in found if density >= options.min_glance * least]
+
+
+def _densities(looks: Sequence[Look], counts: Counts) -> list[float]:
+    """Matches by the size of the smaller image, squared."""
+    return [count / min(look.sizes) ** 2 for look, count in zip(looks, counts(looks), strict=True)]
 
 
 def _clearly_best(

@@ -182,7 +182,7 @@ class GeometryOptions(_Checked):
     min_matches: int = 15
     """Fewest matches that give a geometry."""
     max_iterations: int = 5000
-    """Iterations of the robust estimator, whose samples are seven matches."""
+    """Iterations of the robust estimator where a camera is unknown, and samples are seven matches."""
     max_iterations_calibrated: int = 1500
     """Iterations where both cameras are known, and samples are five: enough to find an inlier ratio of a third."""
     seed: int = 0
@@ -285,9 +285,9 @@ class TurningOptions(_Checked):
     """Where whole images do not agree, look whether they do once the second one is turned by 90, 180 or 270 degrees."""
     image_size: int = 512
     """Long side of a whole image at the matcher for this look, pixels."""
-    min_glance: float = 0.03
-    """Looked for only where a glance, at half that size, finds at least so many times the matches that the images have
-    as they are (0: always)."""
+    min_glance: float = 0.5
+    """Looked for only where a glance, at half that size, finds at least so many times the matches per pixel of the
+    smaller image that the images have as they are (0: always)."""
     min_inliers: int = 25
     """Fewest consistent matches for a turn."""
     min_lead: float = 2.0
@@ -304,9 +304,9 @@ class ZoomOptions(_Checked):
     """So many consistent matches need no such look (0: always look)."""
     factor: float = 3.0
     """How many times smaller than whole images are at the matcher, 1 to 100."""
-    min_glance: float = 0.03
-    """Looked for only where a glance, at half that size, finds at least so many times the matches that the images have
-    as they are (0: always)."""
+    min_glance: float = 1.0
+    """Looked for only where a glance, at half that size, finds at least so many times the matches per pixel of the
+    smaller image that the images have as they are (0: always)."""
     min_inliers: int = 25
     """Fewest consistent matches for a change of size."""
     min_lead: float = 1.5

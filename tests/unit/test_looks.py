@@ -143,9 +143,10 @@ def test_a_turned_image_must_find_clearly_more():
 
 def test_what_a_glance_finds_nothing_in_is_not_looked_at():
     found = {PLAIN: 20, SMALL[1]: 100, SMALL[2]: 100, NEAR: 100, FAR: 100}
-    few = PLAIN_MATCHES * 0.03
-    glances = {SMALL[1]: few - 1, SMALL[2]: few - 1, NEAR: few - 1, FAR: few}
-    assert chosen(found, glances) == (FAR, [PLAIN, FAR])
+    turned = 0.5 * PLAIN_MATCHES * (256 / 600) ** 2  # as many per pixel of the smaller image
+    near, far = PLAIN_MATCHES * (100 / 600) ** 2, PLAIN_MATCHES * (150 / 600) ** 2
+    assert chosen(found, {SMALL[1]: turned - 1, SMALL[2]: turned - 1, NEAR: near - 1, FAR: far})[1] == [PLAIN, FAR]
+    assert chosen(found, {SMALL[1]: turned - 1, SMALL[2]: turned, NEAR: near, FAR: far - 1})[1][:2] == [PLAIN, SMALL[2]]
 
 
 def test_a_glance_has_half_the_size():
