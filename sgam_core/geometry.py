@@ -62,17 +62,17 @@ def estimate_two_view(
     usac = cv2.UsacParams()
     usac.threshold = options.threshold * float(np.median(matches.sigmas))
     usac.confidence = 0.9999
-    calibrated = camera0 is not None and camera1 is not None
-    usac.maxIterations = options.max_iterations_calibrated if calibrated else options.max_iterations
     usac.score = cv2.SCORE_METHOD_MAGSAC
     usac.loMethod = cv2.LOCAL_OPTIM_SIGMA
     usac.randomGeneratorState = options.seed
     found: np.ndarray | None
     try:
         if camera0 is not None and camera1 is not None:
+            usac.maxIterations = options.max_iterations_calibrated
             E, _ = cv2.findEssentialMat(matches.points0, matches.points1, camera0, camera1, None, None, usac)
             found = None if E is None else np.linalg.inv(camera1).T @ E[:3] @ np.linalg.inv(camera0)
         else:
+            usac.maxIterations = options.max_iterations
             found, _ = cv2.findFundamentalMat(matches.points0, matches.points1, usac)
     except cv2.error:  # where local optimisation of planar matches leaves no model, OpenCV raises
         return None
@@ -82,7 +82,7 @@ def estimate_two_view(
     inlier = residuals(F, matches) <= options.max_residual
     return TwoViewModel(
         F=F,
-        calibrated=calibrated,
+        calibrated=camera0 is not None and camera1 is not None,
         num_inliers=int(inlier.sum()),
         num_matches=len(matches),
         planarity=_planarity(matches.select(inlier), usac.threshold),

@@ -32,8 +32,12 @@ class Look:
     @property
     def glance(self) -> Look:
         """The same at half the size."""
-        size0, size1 = (max(round(size / 2), 1) for size in self.sizes)
-        return replace(self, sizes=(size0, size1))
+        return self.smaller(2, 2)
+
+    def smaller(self, by0: float, by1: float) -> Look:
+        """The same with either image so many times smaller."""
+        size0, size1 = self.sizes
+        return replace(self, sizes=(max(round(size0 / by0), 1), max(round(size1 / by1), 1)))
 
 
 Counts = Callable[[Sequence[Look]], Sequence[int]]
@@ -59,9 +63,7 @@ def best_look(
         if (best := _clearly_best(turned, upright, models, turning)) is not None:
             look = replace(plain, turns=best.turns)
     if zoom.enabled and not agree(models([look])[0], zoom.sure_matches, guidance):
-        large0, large1 = look.sizes
-        small0, small1 = (max(round(side / zoom.factor), 1) for side in look.sizes)
-        smaller = [replace(look, sizes=sizes) for sizes in ((small0, large1), (large0, small1))]
+        smaller = [look.smaller(zoom.factor, 1), look.smaller(1, zoom.factor)]
         smaller = _promising(smaller, look, counts, zoom)
         look = _clearly_best(smaller, look, models, zoom) or look
     return look

@@ -6,7 +6,7 @@ import argparse
 import errno
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import version
@@ -119,26 +119,24 @@ def _path_or_none(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructor
     """`PATH (default: not given)` in the help, in place of `{None}|PATH (default: None)`."""
     if info.type != Path | None:
         return None
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="PATH",
-        instance_from_str=lambda texts: None if texts[0] == "None" else Path(texts[0]),
-        is_instance=lambda value: value is None or isinstance(value, Path),
-        str_from_instance=lambda value: [str(value)] if value is not None else _NOT_GIVEN,
-    )
+    return _one_value(info, "PATH", lambda text: None if text == "None" else Path(text))
 
 
 @_HELP.primitive_rule
 def _text(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
     """`TEXT (default: not given)` in the help, in place of `STR (default: '')`."""
-    if info.type is not str:
-        return None
+    return _one_value(info, "TEXT", str) if info.type is str else None
+
+
+def _one_value(
+    info: tyro.constructors.PrimitiveTypeInfo, metavar: str, read: Callable[[str], Any]
+) -> tyro.constructors.PrimitiveConstructorSpec:
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
-        metavar="TEXT",
-        instance_from_str=lambda texts: texts[0],
-        is_instance=lambda value: isinstance(value, str),
-        str_from_instance=lambda value: [value] if value else _NOT_GIVEN,
+        metavar=metavar,
+        instance_from_str=lambda texts: read(texts[0]),
+        is_instance=lambda value: isinstance(value, info.type),
+        str_from_instance=lambda value: [str(value)] if value else _NOT_GIVEN,
     )
 
 

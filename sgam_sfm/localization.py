@@ -41,7 +41,7 @@ from sgam_sfm.inputs import Inputs, read_images
 from sgam_sfm.label_maps import make_label_maps
 from sgam_sfm.machine import find_device
 from sgam_sfm.options import MatchOptions, starting_options
-from sgam_sfm.pairs import Pair, PairList, blocks, read_pairs
+from sgam_sfm.pairs import Pair, PairList, blocks, read_pairs, set_aside
 from sgam_sfm.progress import Stages
 from sgam_sfm.runs.block_matching import match_blocks
 from sgam_sfm.runs.matching import create_area_matcher
@@ -230,8 +230,8 @@ def _pairs(
                 f"{_MAX_REFERENCES}: name `photo reference` pairs in a file and pass it with --pairs"
             )
         return PairList(pairs=tuple(product(photos, posed)))
-    without_pose = sorted({*results.names} - {*posed, *photos})
-    listed = read_pairs(options.pairs, (*photos, *posed), (*failed, *without_pose))
+    unusable = (*failed, *sorted({*results.names} - {*posed, *photos}))  # no pose is no use, either
+    listed = set_aside(read_pairs(options.pairs, (*photos, *posed, *unusable)), unusable)
     known = {*photos}
     for pair in listed.pairs:
         if len(known.intersection(pair)) != 1:

@@ -44,18 +44,17 @@ class PairList:
     num_self: int = 0
 
 
-def read_pairs(path: Path, names: Sequence[str], unreadable: Collection[str] = ()) -> PairList:
+def read_pairs(path: Path, names: Sequence[str]) -> PairList:
     """Read a pair list: `nameA nameB` a line, as hloc and COLMAP write it.
 
     Blank lines and lines that start with `#` are skipped, as are the match indices beneath a pair in COLMAP's raw lists
     (two numbers a line). A tab separates names that contain spaces. `./a.jpg` and `sub\\a.jpg` are understood where
     `a.jpg` and `sub/a.jpg` exist. The first spelling of a pair decides its direction and place.
 
-    Args: names: the images of the collection; unreadable: images that exist but cannot be read, whose pairs are set
-        aside rather than refused.
-    Raises: InputError when the file cannot be read, a line does not name two known images, or no pair is left.
+    Args: names: the images of the collection.
+    Raises: InputError when the file cannot be read, a line does not name two known images, or there is no pair.
     """
-    known = {name: name for name in (*names, *unreadable)}  # pairs share their names: lists of millions stay small
+    known = {name: name for name in names}  # pairs share their names: lists of millions stay small
     pairs: dict[Pair, None] = {}
     num_repeated = num_reversed = num_self = 0
     faults, fault = array("q"), ""
@@ -82,17 +81,19 @@ def read_pairs(path: Path, names: Sequence[str], unreadable: Collection[str] = (
         raise InputError(f"{path}, line {faults[0]}: {fault}{more}")
     if not pairs:
         raise InputError(f"{path} names no pair of two different images; expected lines of the form 'a.jpg b.jpg'")
-    listed = PairList(pairs=tuple(pairs), num_repeated=num_repeated, num_reversed=num_reversed, num_self=num_self)
-    return set_aside(listed, unreadable)
+    return PairList(pairs=tuple(pairs), num_repeated=num_repeated, num_reversed=num_reversed, num_self=num_self)
 
 
 def set_aside(listed: PairList, unreadable: Collection[str]) -> PairList:
     """The list with the pairs of images that cannot be read apart from the others."""
+    if not unreadable:  # as mostly, and lists may have millions of pairs
+        return listed
     broken = set(unreadable)
-    apart = tuple(pair for pair in listed.pairs if broken.intersection(pair))
-    return replace(
-        listed, pairs=tuple(pair for pair in listed.pairs if not broken.intersection(pair)), unreadable=apart
-    )
+    kept: list[Pair] = []
+    apart: list[Pair] = []
+    for pair in listed.pairs:
+        (apart if broken.intersection(pair) else kept).append(pair)
+    return replace(listed, pairs=tuple(kept), unreadable=tuple(apart))
 
 
 def write_pairs(path: Path, pairs: Iterable[Pair]) -> None:

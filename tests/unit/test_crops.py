@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -50,6 +51,17 @@ def test_a_crop_is_a_square_about_its_area_at_the_images_own_resolution():
     assert crop.window == Box(x0=380, y0=230, x1=620, y1=470)  # 1.2 x 200 = 240
     assert crop.size == (240, 240)
     np.testing.assert_array_equal(crop.pixels(), image(1000, 800).pixels[230:470, 380:620])
+
+
+@pytest.mark.parametrize("size", [512, 400, 256, 171, 100])
+def test_much_smaller_crops_show_what_direct_means_of_areas_do(size):
+    noise = np.random.default_rng(0).integers(0, 256, (768, 1024, 3), np.uint8)
+    pixels = cv2.normalize(cv2.GaussianBlur(noise, None, 8), None, 0, 255, cv2.NORM_MINMAX)
+    crop = whole_crop(Image(name="a", pixels=pixels), CropOptions(image_size=size))
+    direct = cv2.resize(pixels, crop.size, interpolation=cv2.INTER_AREA).astype(int)
+    difference = crop.pixels() - direct
+    assert np.abs(difference).mean() < 0.05 * direct.std()
+    assert abs(difference.mean()) < 0.5  # each halving rounds
 
 
 def test_a_crop_is_shifted_inside_and_cut_where_it_does_not_fit():

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sgam_core.errors import InputError
-from sgam_sfm.pairs import PairList, all_pairs, blocks, read_pairs, write_pairs
+from sgam_sfm.pairs import PairList, all_pairs, blocks, read_pairs, set_aside, write_pairs
 
 NAMES = ("a.jpg", "b.jpg", "sub/c.jpg", "my photo.jpg")
 
@@ -46,7 +46,7 @@ def test_match_indices_of_colmaps_raw_lists_are_skipped(pair_file):
 
 def test_pairs_of_unreadable_images_are_set_aside(pair_file):
     path = pair_file("a.jpg bad.jpg\na.jpg b.jpg\nbad.jpg a.jpg\nbad.jpg bad.jpg\n")
-    assert read_pairs(path, NAMES, unreadable={"bad.jpg"}) == PairList(
+    assert set_aside(read_pairs(path, (*NAMES, "bad.jpg")), {"bad.jpg"}) == PairList(
         pairs=(("a.jpg", "b.jpg"),), unreadable=(("a.jpg", "bad.jpg"),), num_reversed=1, num_self=1
     )
 
