@@ -111,7 +111,7 @@ def match_described(
         whole_scale1=crop1.scale,
         fallback=found.fallback,
         notes=found.notes + points.notes,
-        turns=points.look.turns,
+        turned=points.look.degrees,
         zoom=points.look.size_ratio / plain.size_ratio,
         pixels_matched=points.pixels,
         seconds=clock.seconds,

@@ -1,6 +1,6 @@
 """Looks: how whole images are seen when they do not agree as they are. Not in the paper.
 
-Point matchers see through neither quarter turns nor large changes of size. Where two whole images do not agree, they
+Point matchers see through neither large turns nor large changes of size. Where two whole images do not agree, they
 are seen small with the second one turned, then with one of them made smaller. The look that finds clearly more stays,
 and all that follows begins with its matches. Most images that do not agree show different things: a glance at half the
 size of a look, whose matches are only counted, spares them the look itself.
@@ -19,10 +19,10 @@ from sgam_core.types import TwoViewModel
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Look:
-    """How two whole images are seen: their long sides at the matcher, and quarter turns anticlockwise of the second."""
+    """How two whole images are seen: their long sides at the matcher, and degrees anticlockwise of the second one."""
 
     sizes: tuple[int, int]
-    turns: int = 0
+    degrees: int = 0
 
     @property
     def size_ratio(self) -> float:
@@ -58,10 +58,11 @@ def best_look(
     """
     look = plain
     if turning.enabled and not agree(models([look])[0], guidance.sure_matches, guidance):
-        upright, *turned = (Look(sizes=(turning.image_size, turning.image_size), turns=turns) for turns in range(4))
+        sizes = (turning.image_size, turning.image_size)
+        upright, *turned = (Look(sizes=sizes, degrees=degrees) for degrees in range(0, 360, turning.step))
         turned = _promising(turned, look, counts, turning)
         if (best := _clearly_best(turned, upright, models, turning)) is not None:
-            look = replace(plain, turns=best.turns)
+            look = replace(plain, degrees=best.degrees)
     if zoom.enabled and not agree(models([look])[0], zoom.sure_matches, guidance):
         smaller = [look.smaller(zoom.factor, 1), look.smaller(1, zoom.factor)]
         smaller = _promising(smaller, look, counts, zoom)

@@ -279,10 +279,12 @@ class GuidanceOptions(_Checked):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TurningOptions(_Checked):
-    """Quarter turns: photos taken upright and sideways (not in the paper)."""
+    """Photos taken upright, sideways and aslant (not in the paper)."""
 
     enabled: bool = True
-    """Where whole images do not agree, look whether they do once the second one is turned by 90, 180 or 270 degrees."""
+    """Where whole images do not agree, look whether they do once the second one is turned."""
+    step: Literal[45, 90] = 45
+    """It is turned by multiples of so many degrees; 90 is quicker where no photo was taken aslant."""
     image_size: int = 512
     """Long side of a whole image at the matcher for this look, pixels."""
     min_glance: float = 0.5
@@ -330,7 +332,7 @@ class SGAMOptions(_Checked):
     covisible: CovisibleOptions = field(default_factory=CovisibleOptions)
     """The area matcher `covisible`."""
     turning: TurningOptions = field(default_factory=TurningOptions)
-    """Quarter turns."""
+    """Turns in the image plane."""
     zoom: ZoomOptions = field(default_factory=ZoomOptions)
     """Changes of size."""
     geometry: GeometryOptions = field(default_factory=GeometryOptions)

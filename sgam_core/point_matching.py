@@ -75,7 +75,7 @@ class PairPoints:
             whole_crop(image, replace(self.options, image_size=size))
             for image, size in zip(self.images, look.sizes, strict=True)
         )
-        return crop0, crop1.turned(look.turns)
+        return crop0, crop1.turned(look.degrees)
 
     def _see(self, looks: Sequence[Look]) -> None:
         """Match whole images, together, in those ways in which they have not been matched yet."""
@@ -88,9 +88,9 @@ class PairPoints:
         """Point matches inside all confident areas and the doubtful candidates that the limits allow."""
         limited = _limit_candidates(putative.doubtful, max_candidates)
         planned = [*putative.confident, *(candidate for group in limited for candidate in group)]
-        (image0, image1), crop, turns = self.images, self.area_crop, self.look.turns
+        (image0, image1), crop, degrees = self.images, self.area_crop, self.look.degrees
         crops = [
-            (crop(image0, a.area0.box, options), crop(image1, a.area1.box, options).turned(turns)) for a in planned
+            (crop(image0, a.area0.box, options), crop(image1, a.area1.box, options).turned(degrees)) for a in planned
         ]
         chosen = self._within_budget(planned, crops, options.max_crop_pixels)
         found = dict(zip(chosen, self._match([crops[k] for k in chosen]), strict=True))
@@ -110,7 +110,7 @@ class PairPoints:
     def _guided_crops(self, area: AreaMatch, warp: np.ndarray | None) -> tuple[Crop, Crop]:
         crop0 = _scaled_crop(self.images[0], area.area0.box, area.scale0)
         crop1 = _scaled_crop(self.images[1], area.area1.box, area.scale1)
-        return (crop0, crop1.turned(self.look.turns)) if warp is None else warped_alike(crop0, crop1, warp)
+        return (crop0, crop1.turned(self.look.degrees)) if warp is None else warped_alike(crop0, crop1, warp)
 
     def _within_budget(
         self, planned: Sequence[AreaMatch], crops: Sequence[tuple[Crop, Crop]], max_pixels: int

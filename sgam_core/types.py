@@ -132,8 +132,11 @@ class Crop:
             width, height = height, width
         return affine
 
-    def turned(self, turns: int) -> Crop:
-        """The same crop turned by so many more quarter turns anticlockwise."""
+    def turned(self, degrees: int) -> Crop:
+        """The same crop turned anticlockwise by so much more; quarter turns leave its pixels what they are."""
+        if degrees % 90:
+            return _turned_about_its_centre(self, degrees)
+        turns = degrees // 90
         size = self.size[::-1] if turns % 2 else self.size
         return replace(self, size=size, turns=(self.turns + turns) % 4)
 
@@ -202,8 +205,8 @@ class WarpedCrop(Crop):
     def _affine(self) -> Float[np.ndarray, "2 3"]:
         return np.reshape(self.image_from_crop, (2, 3))
 
-    def turned(self, turns: int) -> Crop:
-        raise NotImplementedError("what turns a crop is part of its warp")
+    def turned(self, degrees: int) -> Crop:
+        return _turned_about_its_centre(self, degrees) if degrees % 360 else self
 
     def to_image(self, points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
         image_points: np.ndarray = points @ self._affine[:, :2].T + self._affine[:, 2]
@@ -228,6 +231,18 @@ class WarpedCrop(Crop):
         affine = self._resized.crop_from_image @ whole
         affine[:, 2] += affine[:, :2] @ (0.5, 0.5) - 0.5  # OpenCV counts from the centre of the first pixel
         return cv2.warpAffine(array, affine, self.size, flags=interpolation | cv2.WARP_INVERSE_MAP, borderMode=border)
+
+
+def _turned_about_its_centre(crop: Crop, degrees: int) -> WarpedCrop:
+    """All of a crop, turned anticlockwise, with nothing in the corners."""
+    width, height = crop.size
+    cosine, sine = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    sides = np.abs([[cosine, sine], [sine, cosine]]) @ crop.size
+    size = (max(round(sides[0]), 1), max(round(sides[1]), 1))
+    linear = cv2.invertAffineTransform(crop.crop_from_image)[:, :2] @ [[cosine, -sine], [sine, cosine]]
+    [centre] = crop.to_image(np.array([[width / 2, height / 2]]))
+    affine = np.column_stack([linear, centre - linear @ size / 2])
+    return WarpedCrop(image=crop.image, window=crop.window, size=size, image_from_crop=tuple(affine.ravel().tolist()))
 
 
 def _resize(array: np.ndarray, size: tuple[int, int], *, smooth: bool) -> np.ndarray:
@@ -397,8 +412,8 @@ class PairResult:
     geometry, None when there is none. coverage0, coverage1: share of each image inside kept areas. whole_scale0,
     whole_scale1: matcher pixels per image pixel of plain whole-image matching at the same options. fallback: why the
     whole images were matched instead of areas, empty when areas were used. notes: limits that were reached.
-    pixels_matched: sum over both sides of every point-matcher call. turns: quarter turns anticlockwise by which the
-    point matcher saw the second image. zoom: size at which it saw the second whole image over that of the first one,
+    pixels_matched: sum over both sides of every point-matcher call. turned: degrees anticlockwise by which the point
+    matcher saw the second image turned. zoom: size at which it saw the second whole image over that of the first one,
     against plain matching: below 1 the second one was made smaller, above 1 the first one. seconds: by stage.
     """
 
@@ -412,6 +427,6 @@ class PairResult:
     fallback: str = ""
     notes: tuple[str, ...] = ()
     pixels_matched: int = 0
-    turns: int = 0
+    turned: int = 0
     zoom: float = 1.0
     seconds: Mapping[str, float] = field(default_factory=dict)

@@ -125,8 +125,8 @@ def _facts(picture: PairPicture) -> list[str]:
         ]
     if result.fallback:
         lines.append(f"Matched as whole images: {result.fallback}.")
-    if result.turns:
-        lines.append(f"The right image was turned anticlockwise by {90 * result.turns} degrees to be matched.")
+    if result.turned:
+        lines.append(f"The right image was turned anticlockwise by {result.turned} degrees to be matched.")
     if result.zoom != 1:
         side = "right" if result.zoom < 1 else "left"
         lines.append(f"The {side} image, taken from nearer, was made smaller to be matched as a whole.")

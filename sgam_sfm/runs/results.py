@@ -275,7 +275,7 @@ def swapped(result: PairResult) -> PairResult:
         coverage1=result.coverage0,
         whole_scale0=result.whole_scale1,
         whole_scale1=result.whole_scale0,
-        turns=-result.turns % 4,
+        turned=-result.turned % 360,
         zoom=1 / result.zoom,
     )
 

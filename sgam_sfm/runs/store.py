@@ -39,7 +39,7 @@ _ARRAYS = tuple(array.name for array in fields(Matches))
 _PACKED = ("sigmas0", "sigmas1", "area_index")
 _FACTS = (
     *("fallback", "coverage0", "coverage1", "whole_scale0", "whole_scale1"),
-    *("notes", "pixels_matched", "turns", "zoom"),
+    *("notes", "pixels_matched", "turned", "zoom"),
 )
 _AREAS = TypeAdapter(tuple[AreaMatch, ...])
 _BEGUN = ".begun"

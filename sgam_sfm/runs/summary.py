@@ -59,7 +59,7 @@ class CountedPairs:
         self._totals["raw_matches"] += len(result.matches)
         self._totals["pixels_matched"] += result.pixels_matched
         self._totals["pairs_with_limits"] += bool(result.notes)
-        self._totals["pairs_turned"] += bool(result.turns)
+        self._totals["pairs_turned"] += bool(result.turned)
         self._totals["pairs_zoomed"] += result.zoom != 1
         self._coverage += (result.coverage0 + result.coverage1) / 2
         if result.fallback:

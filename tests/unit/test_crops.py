@@ -106,7 +106,7 @@ def test_an_empty_box_is_refused():
 @given(st.integers(1, 60), st.integers(1, 60), st.integers(1, 90), st.integers(0, 3), st.integers(0, 3))
 def test_a_turned_crop_is_the_crop_turned_anticlockwise(width, height, long_side, turns, more):
     crop = whole_crop(image(width, height, mask=np.eye(height, width, dtype=bool)), CropOptions(image_size=long_side))
-    turned = crop.turned(turns).turned(more)
+    turned = crop.turned(90 * turns).turned(90 * more)
     np.testing.assert_array_equal(turned.pixels(), np.rot90(crop.pixels(), turns + more))
     np.testing.assert_array_equal(turned.mask(), np.rot90(crop.mask(), turns + more))
     assert min(turned.pixels().strides) > 0  # torch takes no others, and numpy calls some of one pixel contiguous
@@ -172,7 +172,35 @@ def test_where_a_warped_crop_shows_nothing_its_mask_says_so():
         np.testing.assert_array_equal(warped.pixels()[expected], crop1.pixels()[10:, 60:end].reshape(-1, 3))
 
 
-def test_a_warped_crop_is_not_turned():
-    crop = whole_crop(image(40, 30), CropOptions(image_size=40))
-    with pytest.raises(NotImplementedError):
-        warped_alike(crop, crop, np.eye(3)[:2])[1].turned(1)
+@given(st.integers(20, 60), st.integers(20, 60), st.integers(20, 90), st.integers(1, 359))
+def test_a_crop_that_is_turned_aslant_shows_all_that_it_showed(width, height, long_side, degrees):
+    crop = whole_crop(image(width, height), CropOptions(image_size=long_side))
+    turned = crop.turned(degrees)
+    corners = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
+    affine = turned.crop_from_image
+    seen = crop.to_image(corners * crop.size) @ affine[:, :2].T + affine[:, 2]
+    np.testing.assert_allclose(seen.min(axis=0), 0, atol=1)
+    np.testing.assert_allclose(seen.max(axis=0), turned.size, atol=1)
+    np.testing.assert_allclose(turned.to_image(seen), crop.to_image(corners * crop.size), atol=1e-6)
+    x, y = affine[:, 0] / np.linalg.norm(affine[:, 0])  # where image x points to
+    off = np.rad2deg(np.arctan2(-y, x)) - degrees
+    assert abs((off + 180) % 360 - 180) < 1
+    assert turned.pixels().shape[1::-1] == turned.size
+    mask = turned.mask()
+    if degrees % 90:
+        assert mask is not None
+        assert mask.sum() == pytest.approx(crop.size[0] * crop.size[1], rel=0.15)
+        assert turned.key != crop.key
+    back = turned.turned(360 - degrees).crop_from_image
+    np.testing.assert_allclose(back[:, :2], crop.crop_from_image[:, :2], atol=1e-9)
+
+
+def test_a_crop_that_is_turned_aslant_looks_so():
+    bright = np.zeros((60, 80, 3), np.uint8)
+    bright[:, 40:] = 255  # bright on the right: above, when turned anticlockwise by a quarter
+    crop = whole_crop(Image(name="half", pixels=bright), CropOptions(image_size=80))
+    pixels = crop.turned(45).pixels()[..., 0]
+    centre = pixels.shape[0] // 2
+    assert pixels[centre - 15, centre + 15] == 255  # above on the right
+    assert pixels[centre + 15, centre - 15] == 0
+    assert abs(float(pixels[centre - 15, centre - 15]) - 128) < 90  # on the line between

@@ -13,7 +13,7 @@ from sgam_core.errors import OptionError
 from sgam_core.geometry import residuals
 from sgam_core.looks import Look, best_look
 from sgam_core.options import GuidanceOptions, TurningOptions, ZoomOptions, changed
-from sgam_core.types import Image, PairResult, TwoViewModel
+from sgam_core.types import Crop, Image, PairResult, TwoViewModel
 from sgam_sfm.matchers.xfeat import XFeatStar
 from tests.room import Room, TrueMatcher
 
@@ -22,15 +22,24 @@ PAIR = ("view03.jpg", "view04.jpg")
 
 @dataclass(frozen=True)
 class Upright:
-    """The true matcher, for which the second image was stored turned by `turns` and is nothing but noise as it is."""
+    """The true matcher, for which the second image was stored turned, and is nothing but noise as it is.
+
+    degrees: anticlockwise, of the second image as it is stored.
+    """
 
     true: TrueMatcher
-    turns: int
+    degrees: int
 
     def match(self, pairs):
         noise = replace(self.true, points=0, known={})
-        upright = [(crop1.turns + self.turns) % 4 == 0 for _, crop1 in pairs]
+        upright = [(_turn_of(crop1) + self.degrees) % 360 == 0 for _, crop1 in pairs]
         return [(self.true if seen else noise).match([pair])[0] for seen, pair in zip(upright, pairs, strict=True)]
+
+
+def _turn_of(crop: Crop) -> int:
+    """Degrees anticlockwise by which a crop shows its image."""
+    along_x, along_y = crop.crop_from_image[:, 0]
+    return round(np.rad2deg(np.arctan2(-along_y, along_x))) % 360
 
 
 def matched(room: Room, matcher, options: SGAMOptions, images: tuple[Image, Image] | None = None) -> PairResult:
@@ -42,12 +51,12 @@ def matched(room: Room, matcher, options: SGAMOptions, images: tuple[Image, Imag
     )
 
 
-@pytest.mark.parametrize("stored", range(4))
+@pytest.mark.parametrize("stored", range(0, 360, 45))
 def test_the_second_image_is_turned_back(room, stored):
     # No crop is warped: a warp turns by itself, but only what is turned in truth.
     options = changed(SGAMOptions(), crop__image_size=320, guidance__max_bend=0.0)
     result = matched(room, Upright(TrueMatcher(room), stored), options)
-    assert result.turns == (4 - stored) % 4
+    assert result.turned == (360 - stored) % 360
     assert result.two_view is not None
     assert result.two_view.num_inliers > 100
     assert any(area.area0.kind == "guided" for area in result.areas)
@@ -55,15 +64,15 @@ def test_the_second_image_is_turned_back(room, stored):
 
 def test_images_that_show_nothing_in_common_stay_as_they_are(room):
     result = matched(room, TrueMatcher(room, points=0), SGAMOptions())
-    assert result.turns == 0
+    assert result.turned == 0
 
 
 def test_it_can_be_turned_off_and_plain_matching_stays_plain(room):
-    matcher = Upright(TrueMatcher(room), 1)
-    assert matched(room, matcher, changed(SGAMOptions(), turning__enabled=False)).turns == 0
+    matcher = Upright(TrueMatcher(room), 90)
+    assert matched(room, matcher, changed(SGAMOptions(), turning__enabled=False)).turned == 0
     images = [room.images[name] for name in PAIR]
     plain = match_described(*images, None, None, WholeImages(), matcher, SGAMOptions())
-    assert plain.turns == 0
+    assert plain.turned == 0
     assert plain.two_view is None or plain.two_view.num_inliers < 20
 
 
@@ -73,7 +82,7 @@ def test_a_learned_matcher_finds_sideways_what_it_finds_upright(room):
     sideways = Image(name="sideways", pixels=np.ascontiguousarray(np.rot90(image1.pixels)))
     upright = matched(room, XFeatStar(), options)
     turned = matched(room, XFeatStar(), options, (image0, sideways))
-    assert turned.turns == 3
+    assert turned.turned == 270
     assert len(turned.matches) > 0.9 * len(upright.matches)
     back = np.stack([image1.width - turned.matches.points1[:, 1], turned.matches.points1[:, 0]], axis=1)
     assert upright.two_view is not None
@@ -83,7 +92,7 @@ def test_a_learned_matcher_finds_sideways_what_it_finds_upright(room):
 
 PLAIN = Look(sizes=(900, 600))
 FAR, NEAR = Look(sizes=(300, 600)), Look(sizes=(900, 200))
-SMALL = [Look(sizes=(512, 512), turns=turns) for turns in range(4)]
+SMALL = {degrees: Look(sizes=(512, 512), degrees=degrees) for degrees in range(0, 360, 45)}
 PLAIN_MATCHES = 200
 
 
@@ -129,28 +138,29 @@ def test_a_smaller_image_must_find_clearly_more():
 
 
 def test_a_turned_image_may_be_near_too():
-    turned = replace(NEAR, turns=1)
-    assert chosen({SMALL[1]: 30, turned: 50})[0] == turned
-    upright = replace(PLAIN, turns=1)
-    assert chosen({SMALL[1]: 30, upright: 150}) == (upright, [PLAIN, SMALL[1], SMALL[0], upright])
+    turned = replace(NEAR, degrees=90)
+    assert chosen({SMALL[90]: 30, turned: 50})[0] == turned
+    upright = replace(PLAIN, degrees=90)
+    assert chosen({SMALL[90]: 30, upright: 150}) == (upright, [PLAIN, SMALL[90], SMALL[0], upright])
 
 
 def test_a_turned_image_must_find_clearly_more():
-    assert chosen({SMALL[2]: 30, SMALL[0]: 16})[0] == PLAIN
-    assert chosen({SMALL[2]: 30, SMALL[0]: 15})[0] == replace(PLAIN, turns=2)
-    assert SMALL[0] not in chosen({SMALL[2]: 24})[1]  # as few as chance finds: nothing to compare with
+    assert chosen({SMALL[180]: 30, SMALL[0]: 16})[0] == PLAIN
+    assert chosen({SMALL[180]: 30, SMALL[0]: 15})[0] == replace(PLAIN, degrees=180)
+    assert SMALL[0] not in chosen({SMALL[180]: 24})[1]  # as few as chance finds: nothing to compare with
 
 
 def test_what_a_glance_finds_nothing_in_is_not_looked_at():
-    found = {PLAIN: 20, SMALL[1]: 100, SMALL[2]: 100, NEAR: 100, FAR: 100}
+    quarter, half = SMALL[90], SMALL[180]
+    found = {PLAIN: 20, quarter: 100, half: 100, NEAR: 100, FAR: 100}
     turned = 0.5 * PLAIN_MATCHES * (256 / 600) ** 2  # as many per pixel of the smaller image
     near, far = PLAIN_MATCHES * (100 / 600) ** 2, PLAIN_MATCHES * (150 / 600) ** 2
-    assert chosen(found, {SMALL[1]: turned - 1, SMALL[2]: turned - 1, NEAR: near - 1, FAR: far})[1] == [PLAIN, FAR]
-    assert chosen(found, {SMALL[1]: turned - 1, SMALL[2]: turned, NEAR: near, FAR: far - 1})[1][:2] == [PLAIN, SMALL[2]]
+    assert chosen(found, {quarter: turned - 1, half: turned - 1, NEAR: near - 1, FAR: far})[1] == [PLAIN, FAR]
+    assert chosen(found, {quarter: turned - 1, half: turned, NEAR: near, FAR: far - 1})[1][:2] == [PLAIN, half]
 
 
 def test_a_glance_has_half_the_size():
-    assert Look(sizes=(511, 1), turns=3).glance == Look(sizes=(256, 1), turns=3)
+    assert Look(sizes=(511, 1), degrees=135).glance == Look(sizes=(256, 1), degrees=135)
 
 
 def test_a_learned_matcher_sees_through_a_change_of_size(room):

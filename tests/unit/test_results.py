@@ -44,7 +44,7 @@ RESULT = PairResult(
     coverage1=0.2,
     whole_scale0=1.0,
     whole_scale1=2.0,
-    turns=1,
+    turned=90,
     zoom=0.5,
 )
 RECORDS = (
@@ -124,7 +124,7 @@ def test_a_pair_is_read_in_the_order_it_is_asked_for(out):
     np.testing.assert_array_equal(back.two_view.F, forth.two_view.F.T)
     assert back.areas[0].area0 == AREA.area1
     assert (back.areas[0].scale0, back.areas[0].scale1, back.whole_scale0) == (0.25, 0.5, 2.0)
-    assert (forth.turns, back.turns, forth.zoom, back.zoom) == (1, 3, 0.5, 2)
+    assert (forth.turned, back.turned, forth.zoom, back.zoom) == (90, 270, 0.5, 2)
     again = swapped(back)
     assert again.areas == forth.areas
     assert results.result(("b c.jpg", "d.jpg")) is None
