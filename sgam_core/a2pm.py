@@ -70,9 +70,9 @@ def match_described(
 ) -> PairResult:
     """The whole algorithm for two images whose areas have been described: SAM, PM, GP, GR, GMC, and guided areas.
 
-    Where the area matcher has an attribute `guides` that is true, photos taken sideways are turned first, those taken
-    from near are made smaller, and guided areas follow. Crops are those of `area_crop`, unless it has a method
-    `crop(image, box, options)` of its own.
+    Where the area matcher has an attribute `guides` that is true, photos taken sideways or aslant are turned first,
+    those taken from near are made smaller, and guided areas follow. Crops are those of `area_crop`, unless it has a
+    method `crop(image, box, options)` of its own.
     """
     points = PairPoints(image0, image1, point_matcher, options.crop, getattr(area_matcher, "crop", area_crop))
     estimate = partial(

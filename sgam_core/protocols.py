@@ -30,8 +30,8 @@ class AreaMatcher(Protocol):
     """Finds areas of two images that show the same thing (AM in the paper).
 
     Areas are cropped by `sgam_core.crops.area_crop`, unless the area matcher has a method `crop(image, box, options)`.
-    Where it has an attribute `guides` that is true, photos taken sideways are turned first, and a second round of
-    guided areas follows.
+    Where it has an attribute `guides` that is true, photos taken sideways or aslant are turned first, and a second
+    round of guided areas follows.
     """
 
     @property

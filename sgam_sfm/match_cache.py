@@ -17,7 +17,7 @@ from sgam_core.errors import SGAMError
 from sgam_sfm.files import replacing
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.options import MatchOptions, as_json
-from sgam_sfm.runs.matching import create_matcher, reset
+from sgam_sfm.runs.matching import create_matcher, is_repeatable, reset
 
 _log = logging.getLogger(__name__)
 
@@ -61,6 +61,11 @@ class CachedMatcher:
         """Begin to count anew."""
         self.charged = self.saved = 0.0
         self.crops.clear()
+
+    @property
+    def repeatable(self) -> bool:
+        """Whether what a pair gives does not depend on what was matched before it."""
+        return is_repeatable(self.matcher)
 
     def reset(self) -> None:
         """Forget what the point matcher has in memory."""

@@ -142,6 +142,8 @@ class MatchOptions:
     output folders of all shares together."""
     block_images: int = 8
     """A block of pairs, the unit of work and of resume, joins up to this many images with as many others."""
+    retry_failed: bool = False
+    """Going on in an OUT that has failed pairs, match these once more; what was matched is kept."""
     device: str = "auto"
     """auto, cpu, cuda, cuda:1, ..."""
     precision: Precision = "auto"
@@ -167,7 +169,7 @@ class MatchOptions:
     covisible: CovisibleOptions = field(default_factory=CovisibleOptions)
     """Area matcher covisible."""
     turning: TurningOptions = field(default_factory=TurningOptions)
-    """Photos taken upright and sideways."""
+    """Photos taken upright, sideways and aslant."""
     zoom: ZoomOptions = field(default_factory=ZoomOptions)
     """Photos taken from near and from far."""
     geometry: GeometryOptions = field(default_factory=GeometryOptions)
@@ -257,7 +259,7 @@ AFTER_MATCHING = frozenset({"refine_intrinsics", "mapper", "mapping", "keypoints
 """Options that keypoints, database and model follow from, and nothing before them."""
 NOT_IN_RESULTS = AFTER_MATCHING | frozenset(
     {"images", "pairs", "cameras", "rigs", "output", "config", "threads", "verbose", "log_json", "accept_licence"}
-    | {"executor", "ray_address", "shard"}
+    | {"executor", "ray_address", "shard", "retry_failed"}
     | {"database", "append", "max_image_size", "worker_timeout"}
 )
 """Options that the raw results of pairs do not follow from: a run can be continued with others. The images, pairs and

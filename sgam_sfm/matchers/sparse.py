@@ -109,6 +109,11 @@ class SparseMatcher:
         """Crop pixels that features were extracted from so far, for cost reports."""
         return self.features.pixels_extracted
 
+    @property
+    def repeatable(self) -> bool:
+        """Whether what a pair gives does not depend on what was matched before it."""
+        return self.features.batch_size == 1
+
     def reset(self) -> None:
         """Forget all features."""
         self.features.clear()

@@ -134,6 +134,11 @@ class XFeatStar:
     def pixels_extracted(self) -> int:
         return self.features.pixels_extracted
 
+    @property
+    def repeatable(self) -> bool:
+        """Whether what a pair gives does not depend on what was matched before it."""
+        return self.features.batch_size == 1
+
     def reset(self) -> None:
         """Forget all features."""
         self.features.clear()

@@ -24,33 +24,49 @@ def match_blocks(
 ) -> dict[str, float]:
     """Match every block that the store does not hold yet, and give the seconds that each step took, of all workers.
 
-    A block follows from its pairs and the options alone: the point matcher starts each one with empty caches, so that
-    what it did before cannot decide how it batches. What is done of a block is kept twice a minute and when the run is
-    stopped, so that a stop costs little however slow the matcher is.
+    A block follows from its pairs and the options alone: where its caches could decide how it batches, the point
+    matcher starts each one with empty ones. What is done of a block is kept twice a minute and when the run is stopped,
+    so that a stop costs little however slow the matcher is. Pairs that are matched once more (`retry_failed`) take
+    their places in a block when all of these are done.
 
     Args: numbers: of the blocks to see to; all of them by default.
     """
     wanted = range(len(work)) if numbers is None else numbers
     kept = {number for number in wanted if store.has(number, work[number])}
-    count_outcomes(stages, store, kept)
-    missing = [number for number in wanted if number not in kept]
-    opened = {number: records for number in missing if (records := store.begun(number, work[number]))}
-    for records in opened.values():
-        _count(stages, records)
-    waiting = [(number, work[number][len(opened.get(number, ())) :]) for number in missing]
+    failed = {number: store.failed(number) for number in kept} if job.options.retry_failed else {}
+    retried = {number for number, pairs in failed.items() if pairs}
+    count_outcomes(stages, store, kept - retried)
+    count_outcomes(stages, store, retried, with_failures=False)
+    opened: dict[int, list[PairRecord]] = {number: [] for number in retried}
+    waiting: list[tuple[int, Sequence[Pair]]] = []
+    for number in wanted:
+        if number in retried:
+            waiting.append((number, failed[number]))
+        elif number not in kept:
+            opened[number] = store.begun(number, work[number])
+            _count(stages, opened[number])
+            waiting.append((number, work[number][len(opened[number]) :]))
     num_pairs = sum(len(work[number]) for number in wanted)
     seconds: dict[str, float] = {}
+
+    def keep(number: int) -> None:
+        if opened[number] and number not in retried:
+            store.write_begun(number, opened[number])
+
     with stages.stage("Matching pairs", num_pairs, num_pairs - sum(len(rest) for _, rest in waiting)) as advance:
         saved = time.monotonic()
         try:
             for number, found in executor.run(job, waiting, stages.working_on):
-                records = opened.setdefault(number, [])
+                records = opened[number]
                 records += found
-                if len(records) == len(work[number]):
+                if number in retried and len(records) == len(failed[number]):
+                    store.replace(number, opened.pop(number))
+                    saved = time.monotonic()
+                elif len(records) == len(work[number]):
                     store.write(number, opened.pop(number))
                     saved = time.monotonic()
                 elif time.monotonic() - saved > _MOST_LOST_SECONDS:
-                    store.write_begun(number, records)
+                    keep(number)
                     saved = time.monotonic()
                 _count(stages, found)
                 for record in found:
@@ -59,17 +75,18 @@ def match_blocks(
                 advance(len(found))
         except BaseException:
             with suppress(OSError):  # what stops the run is to be told, and may be a full disk
-                for number, records in opened.items():
-                    store.write_begun(number, records)
+                for number in opened:
+                    keep(number)
             raise
     return seconds
 
 
-def count_outcomes(stages: Stages, store: PairStore, blocks: Iterable[int]) -> None:
+def count_outcomes(stages: Stages, store: PairStore, blocks: Iterable[int], *, with_failures: bool = True) -> None:
     """Count how the pairs of blocks that are done have ended."""
     for block in blocks:
         for outcome in read_outcomes(store.path(block)):
-            stages.counts.update(_counted(outcome.error, outcome.fallback))
+            if with_failures or not outcome.error:
+                stages.counts.update(_counted(outcome.error, outcome.fallback))
 
 
 def _count(stages: Stages, records: Iterable[PairRecord]) -> None:

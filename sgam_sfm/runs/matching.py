@@ -60,6 +60,11 @@ def reset(matcher: PointMatcher) -> None:
         forget()
 
 
+def is_repeatable(matcher: PointMatcher) -> bool:
+    """Whether a point matcher says that its caches change no result."""
+    return getattr(matcher, "repeatable", False)
+
+
 def create_area_matcher(options: MatchOptions, ignored: Collection[int] = ()) -> AreaMatcher:
     """The area matcher that the options name; ignored: more labels that form no areas."""
     matcher: AreaMatcher = registry.create("area-matcher", options.area_matcher, options=options.sgam_ignoring(ignored))
@@ -101,12 +106,14 @@ class CollectionMatcher:
 
     @contextmanager
     def block(self, pairs: Sequence[Pair]) -> Iterator[None]:
-        """What surrounds the matching of a block's pairs, in their order: caches of the point matcher start empty.
+        """What surrounds the matching of a block's pairs, in their order: caches of the point matcher start empty, but
+        for those that change no result.
 
         Images of the pairs that follow are read while one is matched; not once a process of this run has been ended
         from outside, so that what a pair is told to have done was done for this pair.
         """
-        reset(self._point_matcher)
+        if not is_repeatable(self._point_matcher):
+            reset(self._point_matcher)
         names = () if crashes() else [name for pair in pairs for name in pair]
         with self.image.ahead(names):
             yield

@@ -41,7 +41,7 @@ from sgam_sfm.runs.summary import (
 )
 
 _log = logging.getLogger(__name__)
-_WITHOUT_EFFECT = frozenset({"output", "config", "threads", "verbose", "log_json", "accept_licence"})
+_WITHOUT_EFFECT = frozenset({"output", "config", "threads", "verbose", "log_json", "accept_licence", "retry_failed"})
 
 KNOWN_CAMERAS = "known_cameras"
 """In inputs.json: the images whose camera the user gave."""
@@ -170,7 +170,8 @@ def same_options(options: MatchOptions) -> bool:
 def finished(options: MatchOptions, store: PairStore, work: Sequence[Sequence[Pair]]) -> dict[str, Any] | None:
     """The summary of a run in OUT that ended well and whose results are all still there, None when one is not.
 
-    A run into --database is never finished: what it wrote into may have been changed since.
+    A run into --database is never finished: what it wrote into may have been changed since. Nor is one with failed
+    pairs that are to be matched once more.
     """
     output = options.output
     summary = json_object(output / "summary.json")
@@ -178,6 +179,8 @@ def finished(options: MatchOptions, store: PairStore, work: Sequence[Sequence[Pa
     if not summary or options.database is not None or not all((output / name).exists() for name in files):
         return None
     if not is_whole(output / "database.db") or not all(store.has(index, block) for index, block in enumerate(work)):
+        return None
+    if options.retry_failed and summary["pairs"]["failed"]:
         return None
     _log.info("nothing has changed since this run was finished")
     return summary

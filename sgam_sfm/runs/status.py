@@ -88,14 +88,18 @@ def read_status(output: Path) -> RunStatus:
         heartbeat_seconds=(datetime.now(UTC) - datetime.fromisoformat(run.updated)).total_seconds(),
         fallbacks=dict(sorted(fallbacks.items())),
         summary=_read_json(output / _SUMMARIES.get(run.command, "summary.json")) if run.state == "done" else None,
-        next="" if run.state in ("running", "done") else _how_to_go_on(run.command, output / "options.json"),
+        next=_how_to_go_on(run, output / "options.json", retry=len(failed) > len(inputs.get("left_out", ()))),
     )
 
 
-def _how_to_go_on(command: str, options: Path) -> str:
-    if command != "match":
-        return f"start the same `sgam-sfm {command}` again"
-    return f"sgam-sfm match --config '{options}'" if options.exists() else ""
+def _how_to_go_on(run: RunRecord, options: Path, *, retry: bool) -> str:
+    """What to start next, empty for nothing. Args: retry: whether pairs have failed."""
+    if run.state == "running" or (run.state == "done" and not retry):
+        return ""
+    if run.command != "match":
+        return f"start the same `sgam-sfm {run.command}` again"
+    told = f"sgam-sfm match --config '{options}'" if options.exists() else ""
+    return f"{told} --retry-failed" if told and run.state == "done" else told
 
 
 def _read_json(path: Path) -> dict[str, Any] | None:

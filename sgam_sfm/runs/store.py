@@ -105,6 +105,15 @@ class PairStore:
         """
         return _read_file(self.path(block))
 
+    def failed(self, block: int) -> list[Pair]:
+        """The pairs of a whole block that failed."""
+        return [outcome.pair for outcome in read_outcomes(self.path(block)) if outcome.error]
+
+    def replace(self, block: int, records: Sequence[PairRecord]) -> None:
+        """Put records in the places of those that a whole block has of the same pairs."""
+        new = {record.pair: record for record in records}
+        self.write(block, [new.get(record.pair, record) for record in self.read(block)])
+
     def read_all(self, blocks: int) -> Iterator[PairRecord]:
         """The records of blocks 0, 1, ... in order, one block in memory at a time."""
         for block in range(blocks):

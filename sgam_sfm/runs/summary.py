@@ -164,7 +164,7 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
         told = ", ".join(f"{counted(count, 'pair')}: {reason}" for reason, count in pairs["fallbacks"].items())
         table.add_row("fallbacks", f"matched as whole images: {told}" if told else "none")
     if pairs["pairs_turned"] or pairs["pairs_zoomed"]:
-        turned = f"{counted(pairs['pairs_turned'], 'pair')} with an image sideways"
+        turned = f"{counted(pairs['pairs_turned'], 'pair')} with a turned image"
         table.add_row("looks", f"{turned}, {pairs['pairs_zoomed']} with one from nearer")
     if pairs["pairs_with_limits"]:
         table.add_row(

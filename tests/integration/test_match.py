@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import signal
 import subprocess
@@ -19,6 +20,7 @@ from sgam_sfm import cli
 from sgam_sfm.colmap.pose_errors import compare_poses
 from sgam_sfm.colmap.reading import database_content
 from sgam_sfm.exit_codes import DONE, ERROR, SOME_FAILED, USAGE
+from sgam_sfm.runs.matching import CollectionMatcher
 from sgam_sfm.scene import write_ground_truth
 from tests.room import Room, write_room
 
@@ -142,6 +144,34 @@ def test_bad_images_and_labels_are_counted_and_lose_nothing_else(room, folder, t
     assert summary["pairs"]["fallbacks"]["no usable label map"] == 7
     assert sorted(summary["labels"]["failed"]) == names[1:3]
     assert "10x10" in summary["labels"]["failed"][names[2]]
+
+
+def test_failed_pairs_are_matched_once_more(room, folder, tmp_path, monkeypatch, capsys):
+    output, wrong = tmp_path / "out", tuple(sorted(room.images)[:2])
+    given = arguments(folder, output, "--area-matcher", "none", "--no-mapping")
+    match = CollectionMatcher._match
+
+    def failing(self, pair):
+        if pair == wrong:
+            raise ValueError("a cable was loose")
+        return match(self, pair)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(CollectionMatcher, "_match", failing)
+        assert cli.run(given) == SOME_FAILED
+    assert cli.run(given) == SOME_FAILED
+    capsys.readouterr()
+    assert cli.run(["status", str(output)]) == DONE
+    told = capsys.readouterr().out
+    assert "14 of 15 matched and stored, 1 failed" in told
+    again = f"sgam-sfm match --config '{output / 'options.json'}' --retry-failed"
+    assert f"next       {again}\n" in told
+    assert cli.run(shlex.split(again)[1:]) == DONE
+    assert cli.run(arguments(folder, tmp_path / "well", "--area-matcher", "none", "--no-mapping")) == DONE
+    assert database_content(output / "database.db") == database_content(tmp_path / "well" / "database.db")
+    capsys.readouterr()
+    assert cli.run([*given, "--retry-failed"]) == DONE
+    assert "nothing has changed since" in " ".join(capsys.readouterr().err.split())
 
 
 def test_masked_ground_has_no_match(room, folder, tmp_path):

@@ -28,12 +28,12 @@ WORK = tuple(tuple((name, str(number)) for number in range(4)) for name in NAMES
 
 
 class PairByPair:
-    """Matches nothing, a pair at a time, until something stops it before a pair."""
+    """Matches nothing, a pair at a time, until something stops it before a pair; what is broken fails."""
 
     device = own_device = "cpu"
 
-    def __init__(self, stops: dict[Pair, BaseException] | None = None) -> None:
-        self.stops = stops or {}
+    def __init__(self, stops: dict[Pair, BaseException] | None = None, *, broken: str = "1") -> None:
+        self.stops, self.broken = stops or {}, broken
         self.asked: list[Pair] = []
 
     def run(
@@ -44,14 +44,14 @@ class PairByPair:
                 if pair in self.stops:
                     raise self.stops[pair]
                 self.asked.append(pair)
-                yield number, [record(pair)]
+                yield number, [record(pair, self.broken)]
 
     def facts(self) -> dict[str, Any]:
         return {}
 
 
-def record(pair: Pair) -> PairRecord:
-    if pair[1] == "1":
+def record(pair: Pair, broken: str = "1") -> PairRecord:
+    if pair[1] == broken:
         return PairRecord(pair=pair, result=None, error="broken")
     points = np.random.default_rng(NAMES.index(pair[0]) * 10 + int(pair[1])).uniform(0, 99, (5, 2))
     matches = Matches(points0=points, points1=points + 1, scores=np.ones(5))
@@ -59,10 +59,10 @@ def record(pair: Pair) -> PairRecord:
     return PairRecord(pair=pair, result=result)
 
 
-def matched(folder: Path, executor: PairByPair, fingerprint: str = "mark") -> Stages:
+def matched(folder: Path, executor: PairByPair, fingerprint: str = "mark", **options: Any) -> Stages:
     stages = Stages(quiet=True)
     inputs = Inputs(images={}, cameras={}, failed={}, num_other_files=0, pairs=PairList(pairs=()))
-    job = MatchingJob(options=MatchOptions(images=folder, output=folder), inputs=inputs, labels=None)
+    job = MatchingJob(options=MatchOptions(images=folder, output=folder, **options), inputs=inputs, labels=None)
     match_blocks(WORK, PairStore(folder=folder / "pairs", fingerprint=fingerprint), executor, job, stages)
     return stages
 
@@ -116,6 +116,21 @@ def test_a_damaged_beginning_is_told_and_matched_again(tmp_path, undisturbed, ca
     assert again.asked == list(WORK[1])
     assert f"'{begun}' is damaged" in caplog.text
     assert content(tmp_path) == undisturbed
+
+
+def test_failed_pairs_are_matched_once_more_when_asked_for(tmp_path):
+    matched(tmp_path / "well", PairByPair(broken=""))
+    matched(tmp_path / "out", PairByPair())
+    untouched = PairByPair(broken="")
+    matched(tmp_path / "out", untouched)
+    assert untouched.asked == []
+    with pytest.raises(KeyboardInterrupt):
+        matched(tmp_path / "out", PairByPair({("b", "1"): KeyboardInterrupt()}, broken=""), retry_failed=True)
+    again = PairByPair(broken="")
+    stages = matched(tmp_path / "out", again, retry_failed=True)
+    assert again.asked == [("b", "1")]
+    assert stages.counts == {"pairs_done": 8, "fallbacks": 8}
+    assert content(tmp_path / "out") == content(tmp_path / "well")
 
 
 def test_the_beginning_of_another_run_is_refused(tmp_path):
