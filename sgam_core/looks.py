@@ -1,9 +1,9 @@
 """Looks: how whole images are seen when they do not agree as they are. Not in the paper.
 
 Point matchers see through neither large turns nor large changes of size. Where two whole images do not agree, they
-are seen small with the second one turned, then with one of them made smaller. The look that finds clearly more stays,
-and all that follows begins with its matches. Most images that do not agree show different things: a glance at half the
-size of a look, whose matches are only counted, spares them the look itself.
+are seen with the second one turned, then with one of them made smaller. The look that finds clearly more stays, and all
+that follows begins with its matches. Most images that do not agree show different things: a glance, the same look but
+smaller, whose matches are only counted, spares them the look itself.
 """
 
 from __future__ import annotations
@@ -29,15 +29,14 @@ class Look:
         """Size of the second image over that of the first one."""
         return self.sizes[1] / self.sizes[0]
 
-    @property
-    def glance(self) -> Look:
-        """The same at half the size."""
-        return self.smaller(2, 2)
-
     def smaller(self, by0: float, by1: float) -> Look:
         """The same with either image so many times smaller."""
         size0, size1 = self.sizes
         return replace(self, sizes=(max(round(size0 / by0), 1), max(round(size1 / by1), 1)))
+
+    def within(self, size: int) -> Look:
+        """The same with neither image larger than a size."""
+        return replace(self, sizes=(min(self.sizes[0], size), min(self.sizes[1], size)))
 
 
 Counts = Callable[[Sequence[Look]], Sequence[int]]
@@ -58,14 +57,14 @@ def best_look(
     """
     look = plain
     if turning.enabled and not agree(models([look])[0], guidance.sure_matches, guidance):
-        sizes = (turning.image_size, turning.image_size)
-        upright, *turned = (Look(sizes=sizes, degrees=degrees) for degrees in range(0, 360, turning.step))
-        turned = _promising(turned, look, counts, turning)
-        if (best := _clearly_best(turned, upright, models, turning)) is not None:
-            look = replace(plain, degrees=best.degrees)
+        turned = [replace(look, degrees=degrees) for degrees in range(turning.step, 360, turning.step)]
+        glances = [turn.within(turning.glance_size) for turn in turned]
+        turned = _promising(turned, glances, look, counts, turning.min_glance)
+        look = _clearly_best(turned, look, models, turning) or look
     if zoom.enabled and not agree(models([look])[0], zoom.sure_matches, guidance):
         smaller = [look.smaller(zoom.factor, 1), look.smaller(1, zoom.factor)]
-        smaller = _promising(smaller, look, counts, zoom)
+        glances = [size.smaller(2, 2) for size in smaller]
+        smaller = _promising(smaller, glances, look, counts, zoom.min_glance)
         look = _clearly_best(smaller, look, models, zoom) or look
     return look
 
@@ -78,15 +77,14 @@ def agree(model: TwoViewModel | None, sure_matches: int, guidance: GuidanceOptio
 
 
 def _promising(
-    looks: Sequence[Look], unchanged: Look, counts: Counts, options: TurningOptions | ZoomOptions
+    looks: Sequence[Look], glances: Sequence[Look], unchanged: Look, counts: Counts, min_glance: float
 ) -> list[Look]:
-    """The looks at which a glance finds enough matches, for its size, against those of the images unchanged."""
-    if not options.min_glance:
+    """The looks whose glances find enough matches, for their size, against those of the images unchanged."""
+    if not min_glance:
         return list(looks)
-    glances = [look.glance for look in looks]
     [least] = _densities([unchanged], counts)
     found = zip(looks, _densities(glances, counts), strict=True)
-    return [look for look, density in found if density >= options.min_glance * least]
+    return [look for look, density in found if density >= min_glance * least]
 
 
 def _densities(looks: Sequence[Look], counts: Counts) -> list[float]:
@@ -100,12 +98,6 @@ def _clearly_best(
     """The look with most inliers, where they are enough against those of the images unchanged; None where not."""
     if not looks:
         return None
-    found = _inliers(models(looks))
+    before, *found = (0 if model is None else model.num_inliers for model in models([unchanged, *looks]))
     best = int(np.argmax(found))
-    if found[best] < options.min_inliers:  # of most pairs: the images unchanged need not be matched at this size
-        return None
-    return looks[best] if found[best] >= options.min_lead * _inliers(models([unchanged]))[0] else None
-
-
-def _inliers(models: Sequence[TwoViewModel | None]) -> list[int]:
-    return [0 if model is None else model.num_inliers for model in models]
+    return looks[best] if found[best] >= max(options.min_inliers, options.min_lead * before) else None

@@ -285,11 +285,11 @@ class TurningOptions(_Checked):
     """Where whole images do not agree, look whether they do once the second one is turned."""
     step: Literal[45, 90] = 45
     """It is turned by multiples of so many degrees; 90 is quicker where no photo was taken aslant."""
-    image_size: int = 512
-    """Long side of a whole image at the matcher for this look, pixels."""
+    glance_size: int = 256
+    """Long side of a whole image at the matcher for a glance, pixels."""
     min_glance: float = 0.5
-    """Looked for only where a glance, at half that size, finds at least so many times the matches per pixel of the
-    smaller image that the images have as they are (0: always)."""
+    """A turn is looked at only where a glance finds at least so many times the matches per pixel of the smaller image
+    that the images have as they are (0: always)."""
     min_inliers: int = 25
     """Fewest consistent matches for a turn."""
     min_lead: float = 2.0
@@ -307,8 +307,8 @@ class ZoomOptions(_Checked):
     factor: float = 3.0
     """How many times smaller than whole images are at the matcher, 1 to 100."""
     min_glance: float = 1.0
-    """Looked for only where a glance, at half that size, finds at least so many times the matches per pixel of the
-    smaller image that the images have as they are (0: always)."""
+    """A size is looked at only where a glance, at half of it, finds at least so many times the matches per pixel of
+    the smaller image that the images have as they are (0: always)."""
     min_inliers: int = 25
     """Fewest consistent matches for a change of size."""
     min_lead: float = 1.5

@@ -92,8 +92,13 @@ def test_a_learned_matcher_finds_sideways_what_it_finds_upright(room):
 
 PLAIN = Look(sizes=(900, 600))
 FAR, NEAR = Look(sizes=(300, 600)), Look(sizes=(900, 200))
-SMALL = {degrees: Look(sizes=(512, 512), degrees=degrees) for degrees in range(0, 360, 45)}
+TURNED = {degrees: replace(PLAIN, degrees=degrees) for degrees in range(45, 360, 45)}
 PLAIN_MATCHES = 200
+
+
+def glance(look: Look) -> Look:
+    """What a turn is judged by before it is looked at, or a size."""
+    return look.within(256) if look.sizes == PLAIN.sizes else look.smaller(2, 2)
 
 
 def chosen(found: dict[Look, int], glances: dict[Look, int] | None = None, **zoom) -> tuple[Look, list[Look]]:
@@ -102,8 +107,8 @@ def chosen(found: dict[Look, int], glances: dict[Look, int] | None = None, **zoo
     glances: matches that glances find, where they are not as many as the look's.
     """
     asked = []
-    seen = {look.glance: count for look, count in found.items()}
-    seen |= {look.glance: count for look, count in (glances or {}).items()} | {PLAIN: PLAIN_MATCHES}
+    seen = {glance(look): count for look, count in found.items()}
+    seen |= {glance(look): count for look, count in (glances or {}).items()} | {PLAIN: PLAIN_MATCHES}
 
     def models(looks):
         asked.extend(look for look in looks if look not in asked)
@@ -139,28 +144,29 @@ def test_a_smaller_image_must_find_clearly_more():
 
 def test_a_turned_image_may_be_near_too():
     turned = replace(NEAR, degrees=90)
-    assert chosen({SMALL[90]: 30, turned: 50})[0] == turned
-    upright = replace(PLAIN, degrees=90)
-    assert chosen({SMALL[90]: 30, upright: 150}) == (upright, [PLAIN, SMALL[90], SMALL[0], upright])
+    assert chosen({TURNED[90]: 30, turned: 50})[0] == turned
+    assert chosen({TURNED[90]: 150}) == (TURNED[90], [PLAIN, TURNED[90]])
+    assert chosen({TURNED[45]: 40, TURNED[90]: 150, TURNED[135]: 40})[0] == TURNED[90]
 
 
 def test_a_turned_image_must_find_clearly_more():
-    assert chosen({SMALL[180]: 30, SMALL[0]: 16})[0] == PLAIN
-    assert chosen({SMALL[180]: 30, SMALL[0]: 15})[0] == replace(PLAIN, degrees=180)
-    assert SMALL[0] not in chosen({SMALL[180]: 24})[1]  # as few as chance finds: nothing to compare with
+    assert chosen({TURNED[180]: 30, PLAIN: 16})[0] == PLAIN
+    assert chosen({TURNED[180]: 30, PLAIN: 15})[0] == TURNED[180]
+    assert chosen({TURNED[180]: 24})[0] == PLAIN  # as few as chance finds
 
 
 def test_what_a_glance_finds_nothing_in_is_not_looked_at():
-    quarter, half = SMALL[90], SMALL[180]
-    found = {PLAIN: 20, quarter: 100, half: 100, NEAR: 100, FAR: 100}
+    aslant, half = TURNED[45], TURNED[180]
+    found = {PLAIN: 20, aslant: 100, half: 100, NEAR: 100, FAR: 100}
     turned = 0.5 * PLAIN_MATCHES * (256 / 600) ** 2  # as many per pixel of the smaller image
     near, far = PLAIN_MATCHES * (100 / 600) ** 2, PLAIN_MATCHES * (150 / 600) ** 2
-    assert chosen(found, {quarter: turned - 1, half: turned - 1, NEAR: near - 1, FAR: far})[1] == [PLAIN, FAR]
-    assert chosen(found, {quarter: turned - 1, half: turned, NEAR: near, FAR: far - 1})[1][:2] == [PLAIN, half]
+    assert chosen(found, {aslant: turned - 1, half: turned - 1, NEAR: near - 1, FAR: far})[1] == [PLAIN, FAR]
+    assert chosen(found, {aslant: turned - 1, half: turned, NEAR: near, FAR: far - 1})[1][:2] == [PLAIN, half]
 
 
-def test_a_glance_has_half_the_size():
-    assert Look(sizes=(511, 1), degrees=135).glance == Look(sizes=(256, 1), degrees=135)
+def test_looks_get_smaller():
+    assert Look(sizes=(511, 1), degrees=135).smaller(2, 4) == Look(sizes=(256, 1), degrees=135)
+    assert Look(sizes=(511, 200), degrees=135).within(256) == Look(sizes=(256, 200), degrees=135)
 
 
 def test_a_learned_matcher_sees_through_a_change_of_size(room):
