@@ -16,6 +16,8 @@ import numpy as np
 from sgam_core.options import GuidanceOptions, TurningOptions, ZoomOptions
 from sgam_core.types import TwoViewModel
 
+_RIVAL = 0.5  # of the best glance: what finds less is no rival
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Look:
@@ -79,12 +81,12 @@ def agree(model: TwoViewModel | None, sure_matches: int, guidance: GuidanceOptio
 def _promising(
     looks: Sequence[Look], glances: Sequence[Look], unchanged: Look, counts: Counts, min_glance: float
 ) -> list[Look]:
-    """The looks whose glances find enough matches, for their size, against those of the images unchanged."""
+    """The looks whose glances find enough matches for their size, against the images unchanged and the best glance."""
     if not min_glance:
         return list(looks)
-    [least] = _densities([unchanged], counts)
-    found = zip(looks, _densities(glances, counts), strict=True)
-    return [look for look, density in found if density >= min_glance * least]
+    [plain], found = _densities([unchanged], counts), _densities(glances, counts)
+    least = max(min_glance * plain, _RIVAL * max(found))
+    return [look for look, density in zip(looks, found, strict=True) if density >= least]
 
 
 def _densities(looks: Sequence[Look], counts: Counts) -> list[float]:

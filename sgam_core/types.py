@@ -208,6 +208,10 @@ class WarpedCrop(Crop):
     def turned(self, degrees: int) -> Crop:
         return _turned_about_its_centre(self, degrees) if degrees % 360 else self
 
+    def contains(self, points: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, " N"]:
+        """Which points (N, 2), in crop pixels, lie on the crop where it shows its window."""
+        return Crop.contains(self, points) & self.window.contains(self.to_image(points))
+
     def to_image(self, points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
         image_points: np.ndarray = points @ self._affine[:, :2].T + self._affine[:, 2]
         return image_points

@@ -203,4 +203,6 @@ def test_a_crop_that_is_turned_aslant_looks_so():
     centre = pixels.shape[0] // 2
     assert pixels[centre - 15, centre + 15] == 255  # above on the right
     assert pixels[centre + 15, centre - 15] == 0
+    shown = crop.turned(45).contains(np.array([(centre, centre), (2, 2), (-1, centre)], float))
+    assert shown.tolist() == [True, False, False]  # the corners show nothing
     assert abs(float(pixels[centre - 15, centre - 15]) - 128) < 90  # on the line between

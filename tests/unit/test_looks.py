@@ -164,6 +164,12 @@ def test_what_a_glance_finds_nothing_in_is_not_looked_at():
     assert chosen(found, {aslant: turned - 1, half: turned, NEAR: near, FAR: far - 1})[1][:2] == [PLAIN, half]
 
 
+def test_what_is_next_to_the_right_turn_is_not_looked_at():
+    glances = {TURNED[45]: 29, TURNED[90]: 60, TURNED[135]: 30}
+    found = {TURNED[45]: 50, TURNED[90]: 150, TURNED[135]: 40}
+    assert chosen(found, glances) == (TURNED[90], [PLAIN, TURNED[90], TURNED[135]])
+
+
 def test_looks_get_smaller():
     assert Look(sizes=(511, 1), degrees=135).smaller(2, 4) == Look(sizes=(256, 1), degrees=135)
     assert Look(sizes=(511, 200), degrees=135).within(256) == Look(sizes=(256, 200), degrees=135)
