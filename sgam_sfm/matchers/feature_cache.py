@@ -35,6 +35,7 @@ class FeatureCache(Generic[F]):
         max_bytes: bound of what is kept; the last crop is kept whatever it takes.
 
     Attributes:
+        nbytes: of all that is kept.
         pixels_extracted, seconds_extracting: crop pixels extracted so far, and the time that they took, for cost
             reports; on CUDA some of it shows elsewhere.
     """
@@ -42,6 +43,7 @@ class FeatureCache(Generic[F]):
     def __init__(self, extract: Callable[[Sequence[Crop]], list[F]], *, batch_size: int, max_bytes: int) -> None:
         self.batch_size = batch_size
         self.max_bytes = max_bytes
+        self.nbytes = 0
         self.pixels_extracted = 0
         self.seconds_extracting = 0.0
         self._extract = extract
@@ -52,14 +54,10 @@ class FeatureCache(Generic[F]):
         """Of the crops whose features are kept, least recently used first."""
         return list(self._kept)
 
-    @property
-    def nbytes(self) -> int:
-        """Of all that is kept."""
-        return sum(features.nbytes for features in self._kept.values())
-
     def clear(self) -> None:
         """Forget all."""
         self._kept.clear()
+        self.nbytes = 0
 
     def fetch(self, crops: Sequence[Crop]) -> None:
         """Extract those that are not kept yet, in batches of equal size."""
@@ -86,5 +84,7 @@ class FeatureCache(Generic[F]):
         self.seconds_extracting += time.perf_counter() - start
         for crop, features in zip(crops, extracted, strict=True):
             self._kept[crop.key] = features
+            self.nbytes += features.nbytes
             while self.nbytes > self.max_bytes and len(self._kept) > 1:
-                self._kept.popitem(last=False)
+                _, dropped = self._kept.popitem(last=False)
+                self.nbytes -= dropped.nbytes

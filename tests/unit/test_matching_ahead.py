@@ -31,6 +31,11 @@ class MeanMatcher:
     """One match a pair, at what the crops' means are, so that no image can be taken for another one."""
 
     calls: list[tuple[str, str]] = field(default_factory=list)
+    repeatable: bool = False
+    resets: int = 0
+
+    def reset(self) -> None:
+        self.resets += 1
 
     def match(self, pairs: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
         self.calls += [(crop0.image.name, crop1.image.name) for crop0, crop1 in pairs]
@@ -157,3 +162,12 @@ def test_nothing_is_read_ahead_once_a_process_was_ended_from_outside(options, in
     executor = LocalExecutor(device="cpu", point_matcher=matcher)
     list(executor.run(job, [(0, order)], lambda _: None))
     assert told == [("0.png", 0), ("2.png", 0), ("3.png", 1), ("1.png", 2)]
+
+
+@pytest.mark.parametrize("repeatable", [False, True])
+def test_caches_outlive_a_block_where_they_change_no_result(options, inputs, repeatable):
+    matcher = MeanMatcher(repeatable=repeatable)
+    job = MatchingJob(options=options, inputs=inputs, labels=None)
+    numbered = list(enumerate(blocks(inputs.pairs.pairs, options.block_images)))
+    assert list(LocalExecutor(device="cpu", point_matcher=matcher).run(job, numbered, lambda _: None))
+    assert matcher.resets == (0 if repeatable else len(numbered))

@@ -88,6 +88,11 @@ def test_the_cache_is_bounded_and_drops_the_least_recently_used(crop):
     assert matcher.features.keys == [first.key, third.key]
 
 
+def test_only_what_is_extracted_alone_is_repeatable():
+    assert XFeatStar().repeatable
+    assert not XFeatStar(batch_size=2).repeatable
+
+
 def test_a_batch_gives_what_its_crops_give_alone(crop):
     windows = [Box(x0=x, y0=0, x1=x + 96, y1=96) for x in (0, 16, 32)]
     crops = [Crop(image=crop.image, window=window, size=(96, 96)) for window in windows]
