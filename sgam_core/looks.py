@@ -86,7 +86,7 @@ def _promising(
         return list(looks)
     [plain], found = _densities([unchanged], counts), _densities(glances, counts)
     least = max(min_glance * plain, _RIVAL * max(found))
-    return [look for look, density in zip(looks, found, strict=True) if density >= least]
+    return [look for look, density in zip(looks, found, strict=True) if density >= least > 0]
 
 
 def _densities(looks: Sequence[Look], counts: Counts) -> list[float]:

@@ -164,6 +164,18 @@ def test_what_a_glance_finds_nothing_in_is_not_looked_at():
     assert chosen(found, {aslant: turned - 1, half: turned, NEAR: near, FAR: far - 1})[1][:2] == [PLAIN, half]
 
 
+def test_images_without_any_match_are_not_looked_at_again():
+    asked = []
+
+    def models(looks):
+        asked.extend(looks)
+        return [None] * len(looks)
+
+    options = TurningOptions(), ZoomOptions(), GuidanceOptions()
+    assert best_look(PLAIN, lambda looks: [0] * len(looks), models, *options) == PLAIN
+    assert {*asked} == {PLAIN}
+
+
 def test_what_is_next_to_the_right_turn_is_not_looked_at():
     glances = {TURNED[45]: 29, TURNED[90]: 60, TURNED[135]: 30}
     found = {TURNED[45]: 50, TURNED[90]: 150, TURNED[135]: 40}
