@@ -43,7 +43,7 @@ from sgam_sfm.machine import find_device, use_threads
 from sgam_sfm.options import MatchOptions, with_preset
 from sgam_sfm.pairs import Pair, PairList, blocks, spread_over
 from sgam_sfm.progress import Stages
-from sgam_sfm.runs.matching import CollectionMatcher, create_area_matcher, create_matcher, is_repeatable, reset
+from sgam_sfm.runs.matching import CollectionMatcher, create_area_matcher, create_matcher, reset
 from sgam_sfm.runs.runner import assemble, open_store
 from sgam_sfm.runs.store import PairRecord
 from sgam_sfm.runs.summary import versions
@@ -60,15 +60,13 @@ REST = ("Merging keypoints", "Verifying pairs", "Mapping")
 
 @dataclass
 class TimedMatcher:
-    """A point matcher whose seconds are told apart: of whole images and of areas, and of extracting features."""
+    """A point matcher whose seconds are told apart: of whole images and of areas, and of extracting features.
+
+    It never says that it is repeatable, so that every block, which some variants match twice, begins without features.
+    """
 
     matcher: PointMatcher
     seconds: Counter[str] = field(default_factory=Counter)
-
-    @property
-    def repeatable(self) -> bool:
-        """Whether what a pair gives does not depend on what was matched before it."""
-        return is_repeatable(self.matcher)
 
     def reset(self) -> None:
         """Forget what the point matcher has in memory."""
