@@ -58,7 +58,7 @@ def best_look(
     Args: counts, models: matches of the whole images at each look, and their geometry. guidance: says when they agree.
     """
     look = plain
-    if turning.enabled and not agree(models([look])[0], guidance.sure_matches, guidance):
+    if turning.enabled and not agree(models([look])[0], turning.sure_matches, guidance):
         turned = [replace(look, degrees=degrees) for degrees in range(turning.step, 360, turning.step)]
         glances = [turn.within(turning.glance_size) for turn in turned]
         turned = _promising(turned, glances, look, counts, turning.min_glance)

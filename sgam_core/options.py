@@ -282,7 +282,9 @@ class TurningOptions(_Checked):
     """Photos taken upright, sideways and aslant (not in the paper)."""
 
     enabled: bool = True
-    """Where whole images do not agree, look whether they do once the second one is turned."""
+    """Where whole images do not agree well, look whether they do once the second one is turned."""
+    sure_matches: int = 150
+    """So many consistent matches need no such look (0: always look)."""
     step: Literal[45, 90] = 45
     """It is turned by multiples of so many degrees; 90 is quicker where no photo was taken aslant."""
     glance_size: int = 256
