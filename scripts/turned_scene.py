@@ -40,7 +40,7 @@ def main() -> None:
         rows = [*cut, np.zeros(3), *(camera_to_world @ turn.T), values[21:24], np.array([width, height])]
         lines = [" ".join(f"{value:.10g}" for value in row) for row in rows]
         (folders[1] / path.name).write_text("\n".join(lines) + "\n")
-        np.savetxt(folders[0] / "K.txt", cut)
+    np.savetxt(folders[0] / "K.txt", cut)  # one camera took them all
 
 
 def turned_camera(K: np.ndarray, size: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:

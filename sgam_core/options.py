@@ -297,6 +297,10 @@ class TurningOptions(_Checked):
     min_lead: float = 2.0
     """And at least so many times those that the images have as they are."""
 
+    def __post_init__(self) -> None:
+        _Checked.__post_init__(self)
+        self._within("glance_size", 1, 2**16)
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ZoomOptions(_Checked):

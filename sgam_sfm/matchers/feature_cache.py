@@ -26,8 +26,7 @@ F = TypeVar("F", bound=Sized)
 class FeatureCache(Generic[F]):
     """Features by crop; the least recently used are dropped first.
 
-    Crops of equal size are extracted together, `batch_size` at most: with 1, what a crop gives does not depend on what
-    else is asked for or kept.
+    Crops of equal size are extracted together, `batch_size` at most.
 
     Args:
         extract: the features of crops of one size.
@@ -48,6 +47,11 @@ class FeatureCache(Generic[F]):
         self.seconds_extracting = 0.0
         self._extract = extract
         self._kept: OrderedDict[tuple, F] = OrderedDict()
+
+    @property
+    def repeatable(self) -> bool:
+        """Whether what a crop gives does not depend on what else is asked for or kept: it is extracted alone."""
+        return self.batch_size == 1
 
     @property
     def keys(self) -> list[tuple]:

@@ -137,7 +137,7 @@ class XFeatStar:
     @property
     def repeatable(self) -> bool:
         """Whether what a pair gives does not depend on what was matched before it."""
-        return self.features.batch_size == 1
+        return self.features.repeatable
 
     def reset(self) -> None:
         """Forget all features."""

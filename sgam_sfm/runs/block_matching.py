@@ -59,11 +59,9 @@ def match_blocks(
             for number, found in executor.run(job, waiting, stages.working_on):
                 records = opened[number]
                 records += found
-                if number in retried and len(records) == len(failed[number]):
-                    store.replace(number, opened.pop(number))
-                    saved = time.monotonic()
-                elif len(records) == len(work[number]):
-                    store.write(number, opened.pop(number))
+                if len(records) == len(failed[number] if number in retried else work[number]):
+                    write = store.replace if number in retried else store.write
+                    write(number, opened.pop(number))
                     saved = time.monotonic()
                 elif time.monotonic() - saved > _MOST_LOST_SECONDS:
                     keep(number)

@@ -210,3 +210,8 @@ def test_a_learned_matcher_sees_through_a_change_of_size(room):
 def test_a_smaller_image_is_not_larger():
     with pytest.raises(OptionError, match=r"factor is 0\.5; expected a number from 1 to 100"):
         ZoomOptions(factor=0.5)
+
+
+def test_a_glance_of_no_size_is_refused():
+    with pytest.raises(OptionError, match="glance_size is 0; expected a number from 1 to 65536"):
+        TurningOptions(glance_size=0)
