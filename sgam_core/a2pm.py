@@ -92,7 +92,7 @@ def match_described(
         crop = options.crop
         putative = area_matcher.match(description0, description1, points.whole)
         if guides:  # here areas are to find evidence: a finer look follows
-            putative = supported(putative, points.whole(), options.guidance.max_chance, options.guidance.min_overlap)
+            putative = supported(putative, points.whole(), Frame.of(image0), Frame.of(image1), options.guidance)
             crop = _evidence_crops(options)
         clock.lap("area matching")
         found = _by_areas(putative, crop, points, estimate, options, clock)

@@ -263,11 +263,11 @@ class GuidanceOptions(_Checked):
     evidence_pixels: int = 1_500_000
     """Their pixels per pair, both sides together, where max_crop_pixels is more; those with most support come first."""
     min_matches: int = 20
-    """Fewest consistent matches for a window."""
+    """Fewest consistent matches for a window, and fewest matches by which areas are cut to what both images show."""
     quantile: float = 0.02
-    """Share of the matches, weighted by score, left out at each side of a window (0: none; at most 0.45)."""
+    """Share of the matches, by score, left out at each side of a window or cut area (0: none; at most 0.45)."""
     margin: float = 0.1
-    """Added on each side of a window, share of its long side (0: nothing)."""
+    """Added on each side of a window or cut area, share of its long side (0: nothing)."""
     min_agreement: float = 0.7
     """Share of the first round's consistent matches that the second one's geometry must explain."""
     max_bend: float = 0.04

@@ -1,7 +1,9 @@
 """Area pairs against the plain matches of the whole images: those that these do not support are not looked at.
 
 Not in the paper, which matches every area pair that semantics propose. Plain matches that are mostly wrong still join
-the right areas more often than chance does; where they do not, crops found nothing either (docs/research.md).
+the right areas more often than chance does; where they do not, crops found nothing either (docs/research.md). Right
+areas are often of unequal size, since an object goes on outside of one image, or its label does: they are cut to what
+both show.
 """
 
 from __future__ import annotations
@@ -11,39 +13,65 @@ from operator import itemgetter
 
 from scipy.stats import binom
 
+from sgam_core.covisible import Frame, enclosing_box
+from sgam_core.options import GuidanceOptions
 from sgam_core.types import AreaMatch, AreaState, Matches, PutativeAreas
 
 
-def supported(putative: PutativeAreas, matches: Matches, max_chance: float, min_overlap: float) -> PutativeAreas:
+def supported(
+    putative: PutativeAreas, matches: Matches, frame0: Frame, frame1: Frame, options: GuidanceOptions
+) -> PutativeAreas:
     """The same, area pairs marked as skipped that plain matches join no more often than by chance, or only in part.
 
-    Certain area pairs are put in order, those with most support first.
+    Certain area pairs are cut to the ground that both areas show, and put in order, those with most support first.
+    Doubtful ones stay whole: of those that share an area only one can be true.
 
-    Args: matches: of the whole images. max_chance: probability that as many of the matches that begin in the first area
-        end in the second one, if they end there like all others do. min_overlap: share of the matches of either area
-        that must lie in the other one; that of the first one is the paper's AOR, as far as matches can tell it.
+    Args: matches: of the whole images. options: `max_chance`, the probability that as many of the matches that begin in
+        the first area end in the second one, if they end there like all others do; `min_overlap`, the share of the
+        matches of either area that must lie in the other one; that of the first one is the paper's AOR, as far as
+        matches can tell it.
     """
-
-    def judged(area: AreaMatch) -> tuple[float, AreaMatch]:
-        inside0, inside1 = area.area0.box.contains(matches.points0), area.area1.box.contains(matches.points1)
-        joined, leaving, arriving = int((inside0 & inside1).sum()), int(inside0.sum()), int(inside1.sum())
-        chance = float(binom.sf(joined - 1, leaving, inside1.mean())) if joined else 1.0
-        reason = ""
-        if chance > max_chance:
-            reason = (
-                f"{joined} of {leaving} whole-image matches in its first area end in its second one, no more than "
-                "chance"
-            )
-        elif joined < min_overlap * max(leaving, arriving):
-            reason = (
-                f"{joined} whole-image matches lie in both its areas, {leaving} in the first, {arriving} in the "
-                "second: they overlap in part"
-            )
-        return chance, replace(area, state=AreaState.SKIPPED, reason=reason) if reason else area
-
-    confident = sorted((judged(area) for area in putative.confident), key=itemgetter(0))
+    frames = (frame0, frame1)
+    confident = sorted((_judged(area, matches, options, frames) for area in putative.confident), key=itemgetter(0))
     return replace(
         putative,
         confident=tuple(area for _, area in confident),
-        doubtful=tuple(tuple(judged(area)[1] for area in group) for group in putative.doubtful),
+        doubtful=tuple(tuple(_judged(area, matches, options)[1] for area in group) for group in putative.doubtful),
     )
+
+
+def _judged(
+    area: AreaMatch, matches: Matches, options: GuidanceOptions, frames: tuple[Frame, Frame] | None = None
+) -> tuple[float, AreaMatch]:
+    """The probability of chance, and the area pair with its state. Args: frames: the images of what is to be cut."""
+    inside0, inside1 = area.area0.box.contains(matches.points0), area.area1.box.contains(matches.points1)
+    joined, leaving = int((inside0 & inside1).sum()), int(inside0.sum())
+    chance = float(binom.sf(joined - 1, leaving, inside1.mean())) if joined else 1.0
+    if chance > options.max_chance:
+        reason = (
+            f"{joined} of {leaving} whole-image matches in its first area end in its second one, no more than chance"
+        )
+        return chance, _skipped(area, reason)
+    if frames is not None and joined >= max(options.min_matches, 1):
+        area = _cut(area, matches.select(inside0 & inside1), frames, options)
+        inside0, inside1 = area.area0.box.contains(matches.points0), area.area1.box.contains(matches.points1)
+    joined, leaving, arriving = (int(inside.sum()) for inside in (inside0 & inside1, inside0, inside1))
+    if joined < options.min_overlap * max(leaving, arriving):
+        ends = f"{joined} whole-image matches lie in both its areas, {leaving} in the first, {arriving} in the second"
+        return chance, _skipped(area, f"{ends}: they overlap in part")
+    return chance, area
+
+
+def _cut(area: AreaMatch, shared: Matches, frames: tuple[Frame, Frame], options: GuidanceOptions) -> AreaMatch:
+    """The area pair cut to the ground of the matches that lie in both its areas."""
+    box0, box1 = (
+        enclosing_box(points, shared.scores, frame, options.quantile, options.margin)
+        for points, frame in zip((shared.points0, shared.points1), frames, strict=True)
+    )
+    area0 = replace(area.area0, box=box0.within(area.area0.box))
+    area1 = replace(area.area1, box=box1.within(area.area1.box))
+    return replace(area, area0=area0, area1=area1)
+
+
+def _skipped(area: AreaMatch, reason: str) -> AreaMatch:
+    return replace(area, state=AreaState.SKIPPED, reason=reason)

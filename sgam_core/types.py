@@ -51,6 +51,11 @@ class Box:
         (x, y), w, h = self.center, self.width * factor / 2, self.height * factor / 2
         return Box(x0=x - w, y0=y - h, x1=x + w, y1=y + h)
 
+    def within(self, other: Box) -> Box:
+        """The part of this box inside another one. Raises: ShapeError where they do not overlap."""
+        x0, y0 = max(self.x0, other.x0), max(self.y0, other.y0)
+        return Box(x0=x0, y0=y0, x1=min(self.x1, other.x1), y1=min(self.y1, other.y1))
+
     def times(self, sx: float, sy: float) -> Box:
         """This box in the pixels of an image that is sx times as wide and sy times as high."""
         return Box(x0=self.x0 * sx, y0=self.y0 * sy, x1=self.x1 * sx, y1=self.y1 * sy)
