@@ -134,12 +134,15 @@ class _Found:
 
 
 def _plain(points: PairPoints, estimate: Estimate, options: SGAMOptions) -> _Found | None:
-    """The whole images, where they agree so well or so little that areas have nothing to add; None elsewhere."""
+    """The whole images, where they agree so well or so little that areas have nothing to add; None elsewhere.
+
+    Too few matches for a geometry tell nothing: areas are then the only way to more.
+    """
     model = points.agreement(estimate)
     found = partial(_Found, matches=points.whole(), model=model)
     if agree(model, options.guidance.sure_matches, options.guidance):
         return found(fallback="whole images agree, and crops would be no finer")
-    if (model.inlier_ratio if model else 0.0) < options.guidance.min_inlier_ratio:
+    if model is not None and model.inlier_ratio < options.guidance.min_inlier_ratio:
         return found(fallback="whole images do not agree", final=True)
     return None
 

@@ -252,8 +252,9 @@ class GuidanceOptions(_Checked):
     sure_inlier_ratio: float = 0.5
     """And so large a share of all of them is consistent."""
     min_inlier_ratio: float = 0.35
-    """Where a smaller share is, the images are taken to show different things, and nothing more is tried (0: it is)."""
-    max_chance: float = 0.01
+    """Where a smaller share is, the images are taken to show different things, and nothing more is tried (0: it is);
+    where matches are too few for a geometry, areas are."""
+    max_chance: float = 0.1
     """Where they do not agree, area pairs are matched that whole-image matches join more often than chance: the largest
     probability of chance (1: all area pairs)."""
     min_overlap: float = 0.5

@@ -38,9 +38,7 @@ def reject(
     """
     candidates = [area for area in areas if area.area.state is AreaState.KEPT]
     if not candidates:
-        return Verdict(
-            areas=tuple(areas), model=None, fallback="no area match" if not areas else "no area match left after GP"
-        )
+        return Verdict(areas=tuple(areas), model=None, fallback=_why_none(areas))
     whole = Matches.empty()
     if options.rule == "consensus":
         single = len(candidates) == 1
@@ -59,6 +57,14 @@ def reject(
         model = estimate(Matches.concatenate([pool, _best(whole, len(pool))])) or model
     areas = tuple(_counted(area, model, geometry) for area in judged_all)
     return Verdict(areas=areas, model=model, fallback=fallback)
+
+
+def _why_none(areas: Sequence[MatchedArea]) -> str:
+    if not areas:
+        return "no area match"
+    if all(area.area.state is AreaState.SKIPPED for area in areas):
+        return "every area match was skipped"
+    return "no area match left after GP"
 
 
 def _consensus(

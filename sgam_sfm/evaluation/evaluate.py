@@ -89,9 +89,8 @@ def evaluate(options: EvaluateOptions, stages: Stages) -> dict[str, Any]:
     variants = _variants(common, ablation=options.ablation)
     needs_labels = any(create_area_matcher(variant.options).needs_labels for variant in variants)
     needs_labels |= bool(common.mask_matches)
+    matcher = CachedMatcher.of(common, inputs, common.output / "cache" / "matches")  # first: it may lack weights
     labels = make_label_maps(common, inputs.images, stages) if needs_labels else None
-    matcher = CachedMatcher.of(common, inputs, common.output / "cache" / "matches")
-
     shown = {} if labels is None else _shown_labels(labels, {name for pair in pairs for name in pair})
     facts = {}
     whole: dict[Pair, Matches] = {}

@@ -124,11 +124,11 @@ def test_matches_along_a_line_tell_no_map():
     assert warp_between(Matches(points0=points, points1=other, scores=np.ones(100)), BOTH, GuidanceOptions()) is None
 
 
-def in_room(room: Room, options: SGAMOptions, names=("view03.jpg", "view04.jpg")):
+def in_room(room: Room, options: SGAMOptions, names=("view03.jpg", "view04.jpg"), point_matcher=None):
     matcher = SemanticAreaMatcher(options=options.semantic)
     images = [room.images[name] for name in names]
     described = [matcher.describe(room.images[name], room.renderings[name].labels.astype(np.int32)) for name in names]
-    return match_described(*images, *described, matcher, TrueMatcher(room), options)
+    return match_described(*images, *described, matcher, point_matcher or TrueMatcher(room), options)
 
 
 def test_whole_images_that_tell_nothing_are_judged_once(room, monkeypatch):
@@ -187,3 +187,22 @@ def test_areas_find_the_evidence_where_whole_images_do_not_agree(room):
     first = in_room(room, changed(options, guidance__enabled=False))
     assert not any(area.area0.kind == "guided" for area in first.areas)
     assert np.median(found.matches.sigmas) < np.median(first.matches.sigmas)
+
+
+class Timid(TrueMatcher):
+    """Finds next to nothing on whole images, as matchers do that keep sure matches alone."""
+
+    def match(self, pairs):
+        rows = np.arange(10)
+        return [
+            found.select(rows) if crop0.window.width == crop0.image.width else found
+            for (crop0, _), found in zip(pairs, super().match(pairs), strict=True)
+        ]
+
+
+def test_areas_find_the_evidence_where_whole_images_have_too_few_matches(room):
+    found = in_room(room, COARSE, point_matcher=Timid(room))
+    kept = [area for area in found.areas if area.state is AreaState.KEPT]
+    assert {area.area0.kind for area in kept} & {"object", "intersection"}
+    assert found.two_view is not None
+    assert len(found.matches) > 100

@@ -182,7 +182,9 @@ def test_gr_falls_back_when_the_areas_agree_on_nothing():
 def test_gr_without_areas_says_so():
     assert judge([]).fallback == "no area match"
     gone = true_area(WINDOWS[0], 1).resolved(AreaState.UNRESOLVED, "GP: ...")
-    assert judge([gone]).fallback == "no area match left after GP"
+    skipped = true_area(WINDOWS[0], 1).resolved(AreaState.SKIPPED, "no more than chance")
+    assert judge([gone, skipped]).fallback == "no area match left after GP"
+    assert judge([skipped]).fallback == "every area match was skipped"
 
 
 def test_gr_can_be_turned_off():
