@@ -84,7 +84,7 @@ def match_described(
     guides = getattr(area_matcher, "guides", False)
     if guides:
         models = partial(points.models, estimate=estimate)
-        points.look = best_look(plain, points.counts, models, options.turning, options.zoom, options.guidance)
+        points.look = best_look(plain, points.vote, models, options.looks, options.guidance)
     guides = guides and options.guidance.enabled
     found = _plain(points, estimate, options) if guides else None
     clock.lap("whole images")

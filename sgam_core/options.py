@@ -279,51 +279,23 @@ class GuidanceOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class TurningOptions(_Checked):
-    """Photos taken upright, sideways and aslant (not in the paper)."""
+class LookOptions(_Checked):
+    """Photos taken sideways, aslant, from near and from far (not in the paper)."""
 
     enabled: bool = True
-    """Where whole images do not agree well, look whether they do once the second one is turned."""
+    """Where whole images do not agree well, look whether they do with the second one turned or one made smaller."""
     sure_matches: int = 150
     """So many consistent matches need no such look (0: always look)."""
-    step: Literal[45, 90] = 45
-    """It is turned by multiples of so many degrees; 90 is quicker where no photo was taken aslant."""
-    glance_size: int = 256
-    """Long side of a whole image at the matcher for a glance, pixels."""
-    min_glance: float = 0.5
-    """A turn is looked at only where a glance finds at least so many times the matches per pixel of the smaller image
-    that the images have as they are (0: always)."""
+    min_votes: int = 5
+    """Fewest landmarks that agree on a turn and a change of size."""
+    min_turn: int = 15
+    """Smaller turns are left to the point matcher, degrees."""
+    min_growth: float = 1.5
+    """Smaller changes of size are left to the point matcher."""
     min_inliers: int = 25
-    """Fewest consistent matches for a turn."""
-    min_lead: float = 2.0
-    """And at least so many times those that the images have as they are."""
-
-    def __post_init__(self) -> None:
-        _Checked.__post_init__(self)
-        self._within("glance_size", 1, 2**16)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ZoomOptions(_Checked):
-    """Photos taken from near and from far (not in the paper)."""
-
-    enabled: bool = True
-    """Where whole images do not agree well, look whether they do once one of them is made smaller."""
-    sure_matches: int = 150
-    """So many consistent matches need no such look (0: always look)."""
-    factor: float = 3.0
-    """How many times smaller than whole images are at the matcher, 1 to 100."""
-    min_glance: float = 1.0
-    """A size is looked at only where a glance, at half of it, finds at least so many times the matches per pixel of
-    the smaller image that the images have as they are (0: always)."""
-    min_inliers: int = 25
-    """Fewest consistent matches for a change of size."""
+    """Fewest consistent matches so seen."""
     min_lead: float = 1.5
     """And at least so many times those that the images have as they are."""
-
-    def __post_init__(self) -> None:
-        _Checked.__post_init__(self)
-        self._within("factor", 1, 100)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -338,10 +310,8 @@ class SGAMOptions(_Checked):
     """The area matcher `tiles`."""
     covisible: CovisibleOptions = field(default_factory=CovisibleOptions)
     """The area matcher `covisible`."""
-    turning: TurningOptions = field(default_factory=TurningOptions)
-    """Turns in the image plane."""
-    zoom: ZoomOptions = field(default_factory=ZoomOptions)
-    """Changes of size."""
+    looks: LookOptions = field(default_factory=LookOptions)
+    """Turns in the image plane and changes of size."""
     geometry: GeometryOptions = field(default_factory=GeometryOptions)
     """Robust estimation."""
     prediction: PredictionOptions = field(default_factory=PredictionOptions)
@@ -376,8 +346,7 @@ PAPER = changed(
     collection__rule="paper",
     collection__min_coverage=0.3,
     guidance__enabled=False,
-    turning__enabled=False,
-    zoom__enabled=False,
+    looks__enabled=False,
 )
 """The paper's own parameters (its appendix), with GR in the form that can accept an area."""
 
@@ -395,11 +364,9 @@ FAST = changed(
     semantic__intersections__enabled=False,
     prediction__max_candidates=3,
     guidance__min_gain=1.2,
-    turning__enabled=False,
-    zoom__enabled=False,
 )
-"""At most half more time than whole images take: few areas, where whole images do not agree, a second round only where
-it is a fifth finer, and no look at photos turned or made smaller."""
+"""At most half more time than whole images take: few areas, where whole images do not agree, and a second round only
+where it is a fifth finer."""
 
 PRESETS: Mapping[str, SGAMOptions] = MappingProxyType(
     {"default": SGAMOptions(), "fast": FAST, "paper": PAPER, "scannet": SCANNET, "outdoor": OUTDOOR}

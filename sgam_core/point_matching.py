@@ -11,6 +11,7 @@ import numpy as np
 
 from sgam_core.crops import box_crop, warped_alike, whole_crop
 from sgam_core.errors import ShapeError
+from sgam_core.landmarks import Vote, vote
 from sgam_core.looks import Look
 from sgam_core.options import CropOptions
 from sgam_core.prediction import Estimate, MatchedArea
@@ -56,10 +57,9 @@ class PairPoints:
         """The geometry of the whole images."""
         return self.models([self.look], estimate)[0]
 
-    def counts(self, looks: Sequence[Look]) -> list[int]:
-        """How many matches the whole images have, seen in several ways."""
-        self._see(looks)
-        return [len(self._seen[look]) for look in looks]
+    def vote(self) -> Vote:
+        """How image 1 lies and is sized against image 0, as their landmarks have it."""
+        return vote(*(image.landmarks for image in self.images))
 
     def models(self, looks: Sequence[Look], estimate: Estimate) -> list[TwoViewModel | None]:
         """The geometry of the whole images, seen in several ways."""

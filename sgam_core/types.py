@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import cached_property
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int32, UInt8
 
 from sgam_core.errors import ShapeError
+from sgam_core.landmarks import Landmarks, find_landmarks
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -67,7 +69,7 @@ class Box:
         return inside
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Image:
     """One image as the algorithm sees it.
 
@@ -98,6 +100,11 @@ class Image:
     @property
     def height(self) -> int:
         return int(self.pixels.shape[0])
+
+    @cached_property
+    def landmarks(self) -> Landmarks:
+        """What tells how it lies and is sized against another image; found when first asked for."""
+        return find_landmarks(self.pixels, self.mask)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

@@ -24,12 +24,11 @@ from sgam_core.options import (
     CropOptions,
     GeometryOptions,
     GuidanceOptions,
+    LookOptions,
     PredictionOptions,
     RejectionOptions,
     SemanticOptions,
     TileOptions,
-    TurningOptions,
-    ZoomOptions,
 )
 from sgam_sfm.machine import Precision
 from sgam_sfm.merging.keypoints import KeypointOptions
@@ -168,10 +167,8 @@ class MatchOptions:
     """Area matcher tiles."""
     covisible: CovisibleOptions = field(default_factory=CovisibleOptions)
     """Area matcher covisible."""
-    turning: TurningOptions = field(default_factory=TurningOptions)
-    """Photos taken upright, sideways and aslant."""
-    zoom: ZoomOptions = field(default_factory=ZoomOptions)
-    """Photos taken from near and from far."""
+    looks: LookOptions = field(default_factory=LookOptions)
+    """Photos taken sideways, aslant, from near and from far."""
     geometry: GeometryOptions = field(default_factory=GeometryOptions)
     """Robust epipolar geometry."""
     prediction: PredictionOptions = field(default_factory=PredictionOptions)

@@ -144,8 +144,7 @@ def test_whole_images_that_tell_nothing_are_judged_once(room, monkeypatch):
         SGAMOptions(),
         guidance__sure_matches=10_000,
         guidance__min_gain=1e9,
-        turning__enabled=False,
-        zoom__enabled=False,
+        looks__enabled=False,
         semantic__objects__enabled=False,
         semantic__intersections__enabled=False,
     )
