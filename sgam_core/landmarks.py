@@ -38,18 +38,17 @@ class Vote:
     """How image 1 lies and is sized against image 0, as most landmarks have it.
 
     degrees: by which image 1 is to be turned anticlockwise to lie as image 0 does, 0 to 345. growth: how much larger
-    things are in image 1, both being resized to one long side. count: votes for it; unchanged: for no change at all.
+    things are in image 1, both being resized to one long side. count: votes for it.
     """
 
     degrees: int
     growth: float
     count: int
-    unchanged: int
 
 
 def find_landmarks(pixels: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None) -> Landmarks:
     """The landmarks of an image, inside its mask."""
-    scale = min(_LONG_SIDE / max(pixels.shape), 1.0)
+    scale = min(_LONG_SIDE / max(pixels.shape[:2]), 1.0)
     size = tuple(max(round(scale * side), 1) for side in pixels.shape[1::-1])
     gray = cv2.cvtColor(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
     wanted = None
@@ -81,7 +80,6 @@ def vote(landmarks0: Landmarks, landmarks1: Landmarks) -> Vote:
         degrees=int(turn_bins[best_turn]),
         growth=float(2 ** growth_bins[best_growth]),
         count=int(counts.max()),
-        unchanged=int(counts[0, len(growth_bins) // 2]),
     )
 
 

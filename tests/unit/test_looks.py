@@ -7,6 +7,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from sgam_core import SemanticAreaMatcher, SGAMOptions, WholeImages, match_described
 from sgam_core.geometry import residuals
@@ -93,7 +95,7 @@ def chosen(vote: Vote, found: dict[Look, int], **options) -> tuple[Look, list[Lo
 
 def voted(degrees: int = 0, growth: float = 1.5, count: int = 20) -> Vote:
     """As large at the matcher as things are in the first image, when it says nothing else."""
-    return Vote(degrees=degrees, growth=growth, count=count, unchanged=0)
+    return Vote(degrees=degrees, growth=growth, count=count)
 
 
 TURNED = replace(PLAIN, degrees=90)
@@ -161,6 +163,18 @@ def test_a_photo_turned_and_taken_from_near_at_once_is_seen_through(room):
     assert found.zoom == pytest.approx(1 / 3, rel=0.2)
     assert found.two_view is not None
     assert found.two_view.num_inliers > 40
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0, 360), st.floats(1, 4))
+def test_landmarks_vote_for_the_turn_and_the_change_of_size(room, degrees, growth):
+    image = room.images[PAIR[0]]
+    center = (image.width / 2, image.height / 2)
+    turn = cv2.getRotationMatrix2D(center, degrees, growth)  # anticlockwise
+    pixels = cv2.warpAffine(image.pixels, turn, (image.width, image.height), flags=cv2.INTER_CUBIC)
+    found = vote(image.landmarks, Image(name="turned", pixels=pixels).landmarks)
+    assert abs((found.degrees + degrees + 180) % 360 - 180) <= 20
+    assert 0.7 < found.growth / growth < 1.4
 
 
 def test_an_image_without_landmarks_has_no_vote():
