@@ -83,8 +83,8 @@ def match_described(
     plain = points.look
     guides = getattr(area_matcher, "guides", False)
     if guides:
-        models = partial(points.models, estimate=estimate)
-        points.look = best_look(plain, points.vote, models, options.looks, options.guidance)
+        model = partial(points.model, estimate=estimate)
+        points.look = best_look(plain, points.vote, model, options.looks, options.guidance)
     guides = guides and options.guidance.enabled
     found = _plain(points, estimate, options) if guides else None
     clock.lap("whole images")

@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
+from sgam_core.sift import strongest_sift
+
 _LONG_SIDE = 512  # pixels of the image that landmarks are found in
 _MOST = 1500  # in an image
 _RATIO = 0.9  # of the distances to the nearest descriptor and to the second
@@ -51,15 +53,11 @@ def find_landmarks(pixels: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H
     scale = min(_LONG_SIDE / max(pixels.shape[:2]), 1.0)
     size = tuple(max(round(scale * side), 1) for side in pixels.shape[1::-1])
     gray = cv2.cvtColor(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
-    wanted = None
     if mask is not None:
-        wanted = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT)
-    keypoints, descriptors = cv2.SIFT.create(_MOST).detectAndCompute(gray, wanted)
-    if not keypoints:
-        descriptors = np.zeros((0, 128), np.float32)
-    shares = descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9)
+        mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT).astype(bool)
+    keypoints, descriptors = strongest_sift(gray, mask, _MOST)
     return Landmarks(
-        descriptors=np.sqrt(shares),
+        descriptors=descriptors,
         angles=np.array([keypoint.angle for keypoint in keypoints], np.float32),
         sizes=np.array([keypoint.size for keypoint in keypoints], np.float32) / max(size),
     )

@@ -7,7 +7,7 @@ them made smaller, or both. Where that finds clearly more, all that follows begi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from sgam_core.landmarks import Vote
@@ -28,23 +28,24 @@ class Look:
         return self.sizes[1] / self.sizes[0]
 
 
-Models = Callable[[Sequence[Look]], Sequence[TwoViewModel | None]]
-
-
 def best_look(
-    plain: Look, vote: Callable[[], Vote], models: Models, options: LookOptions, guidance: GuidanceOptions
+    plain: Look,
+    vote: Callable[[], Vote],
+    model: Callable[[Look], TwoViewModel | None],
+    options: LookOptions,
+    guidance: GuidanceOptions,
 ) -> Look:
     """The look that landmarks vote for, where whole images agree clearly better so; else the plain one.
 
-    Args: vote: of the whole images' landmarks. models: the geometry of the whole images at each look. guidance: says
-        when they agree.
+    Args: vote: of the whole images' landmarks. model: the geometry of the whole images at a look. guidance: says when
+        they agree.
     """
-    if not options.enabled or agree(models([plain])[0], options.sure_matches, guidance):
+    if not options.enabled or agree(model(plain), options.sure_matches, guidance):
         return plain
     look = voted_look(plain, vote(), options)
     if look == plain:
         return plain
-    before, after = (0 if model is None else model.num_inliers for model in models([plain, look]))
+    before, after = (0 if (found := model(each)) is None else found.num_inliers for each in (plain, look))
     return look if after >= max(options.min_inliers, options.min_lead * before) else plain
 
 

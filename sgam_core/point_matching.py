@@ -50,24 +50,21 @@ class PairPoints:
 
     def whole(self) -> Matches:
         """Plain matches of the whole images."""
-        self._see([self.look])
-        return self._seen[self.look]
+        return self._see(self.look)
 
     def agreement(self, estimate: Estimate) -> TwoViewModel | None:
         """The geometry of the whole images."""
-        return self.models([self.look], estimate)[0]
+        return self.model(self.look, estimate)
 
     def vote(self) -> Vote:
         """How image 1 lies and is sized against image 0, as their landmarks have it."""
         return vote(*(image.landmarks for image in self.images))
 
-    def models(self, looks: Sequence[Look], estimate: Estimate) -> list[TwoViewModel | None]:
-        """The geometry of the whole images, seen in several ways."""
-        self._see(looks)
-        for look in looks:
-            if look not in self._models:
-                self._models[look] = estimate(self._seen[look])
-        return [self._models[look] for look in looks]
+    def model(self, look: Look, estimate: Estimate) -> TwoViewModel | None:
+        """The geometry of the whole images, seen so."""
+        if look not in self._models:
+            self._models[look] = estimate(self._see(look))
+        return self._models[look]
 
     def whole_crops(self, look: Look) -> tuple[Crop, Crop]:
         """What the matcher sees."""
@@ -77,10 +74,11 @@ class PairPoints:
         )
         return crop0, crop1.turned(look.degrees)
 
-    def _see(self, looks: Sequence[Look]) -> None:
-        """Match whole images, together, in those ways in which they have not been matched yet."""
-        missing = [look for look in looks if look not in self._seen]
-        self._seen |= zip(missing, self._match([self.whole_crops(look) for look in missing]), strict=True)
+    def _see(self, look: Look) -> Matches:
+        """Plain matches of the whole images, seen so; found once."""
+        if look not in self._seen:
+            [self._seen[look]] = self._match([self.whole_crops(look)])
+        return self._seen[look]
 
     def inside(
         self, putative: PutativeAreas, options: CropOptions, max_candidates: int

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import torch
 
+from sgam_core.sift import strongest_sift
 from sgam_core.types import Crop
 from sgam_sfm.machine import find_device
 from sgam_sfm.matchers.ratio import RatioAssignment
@@ -26,11 +27,6 @@ class SIFTExtractor:
 
     def __init__(self, max_features: int, device: torch.device) -> None:
         self._count = checked_count(max_features)
-        # With its precise upscaling, OpenCV has the first pixel centred on 0 in every octave.
-        self._strongest, self._all = (
-            cv2.SIFT.create(nfeatures=count, contrastThreshold=CONTRAST, enable_precise_upscale=True)
-            for count in (max_features, 0)
-        )
         self._device = device
 
     def __call__(self, crops: Sequence[Crop]) -> list[Features]:
@@ -38,20 +34,16 @@ class SIFTExtractor:
 
     def _extract(self, crop: Crop) -> Features:
         gray = cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY)
-        mask = crop.mask()
-        if mask is None:
-            found, descriptors = self._strongest.detectAndCompute(gray, None)
-        else:  # OpenCV would count those under the mask, too
-            found, descriptors = self._all.detectAndCompute(gray, mask.astype(np.uint8))
-            best = np.argsort([-keypoint.response for keypoint in found], kind="stable")[: self._count]
-            found, descriptors = [found[row] for row in best], descriptors[best] if len(best) else descriptors
+        # With its precise upscaling, OpenCV has the first pixel centred on 0 in every octave.
+        found, descriptors = strongest_sift(
+            gray, crop.mask(), self._count, contrastThreshold=CONTRAST, enable_precise_upscale=True
+        )
         if not found:
             return Features.none(crop, CHANNELS, self._device)
         points = np.array([keypoint.pt for keypoint in found], np.float32) + np.float32(0.5)
         sizes = np.array([keypoint.size for keypoint in found], np.float32)
         angles = np.deg2rad(np.array([keypoint.angle for keypoint in found], np.float32))
-        root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-6))
-        arrays = (points, root, np.maximum(sizes / FINEST_SIZE, 1), np.stack([sizes / 2, angles], 1))
+        arrays = (points, descriptors, np.maximum(sizes / FINEST_SIZE, 1), np.stack([sizes / 2, angles], 1))
         tensors = [torch.from_numpy(array.astype(np.float32)).to(self._device) for array in arrays]
         return Features(tensors[0], tensors[1], crop.size, tensors[2], tensors[3])
 

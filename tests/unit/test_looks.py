@@ -45,6 +45,7 @@ def test_the_second_image_is_turned_back(room, stored):
     assert abs((result.turned + stored + 180) % 360 - 180) <= 15
     assert result.two_view is not None
     assert result.two_view.num_inliers > 100
+    assert any(area.area0.kind == "guided" for area in result.areas)
 
 
 def test_images_that_show_nothing_in_common_stay_as_they_are(room):
@@ -81,16 +82,14 @@ def chosen(vote: Vote, found: dict[Look, int], **options) -> tuple[Look, list[Lo
     """The best look where those of `found` have so many inliers, others none; and all whose geometry was asked for."""
     asked = []
 
-    def models(looks):
-        asked.extend(look for look in looks if look not in asked)
-        return [
-            TwoViewModel(F=np.eye(3), calibrated=False, num_inliers=n, num_matches=max(n, 100), planarity=0.0)
-            if (n := found.get(look, 0))
-            else None
-            for look in looks
-        ]
+    def model(look):
+        if look not in asked:
+            asked.append(look)
+        if not (n := found.get(look, 0)):
+            return None
+        return TwoViewModel(F=np.eye(3), calibrated=False, num_inliers=n, num_matches=max(n, 100), planarity=0.0)
 
-    return best_look(PLAIN, lambda: vote, models, LookOptions(**options), GuidanceOptions()), asked
+    return best_look(PLAIN, lambda: vote, model, LookOptions(**options), GuidanceOptions()), asked
 
 
 def voted(degrees: int = 0, growth: float = 1.5, count: int = 20) -> Vote:
