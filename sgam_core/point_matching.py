@@ -108,7 +108,8 @@ class PairPoints:
     def _guided_crops(self, area: AreaMatch, warp: np.ndarray | None) -> tuple[Crop, Crop]:
         crop0 = _scaled_crop(self.images[0], area.area0.box, area.scale0)
         crop1 = _scaled_crop(self.images[1], area.area1.box, area.scale1)
-        return (crop0, crop1.turned(self.look.degrees)) if warp is None else warped_alike(crop0, crop1, warp)
+        pair = (crop0, crop1.turned(self.look.degrees)) if warp is None else warped_alike(crop0, crop1, warp)
+        return replace(pair[0], alike=True), replace(pair[1], alike=True)
 
     def _within_budget(
         self, planned: Sequence[AreaMatch], crops: Sequence[tuple[Crop, Crop]], max_pixels: int

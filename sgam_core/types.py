@@ -112,20 +112,22 @@ class Crop:
     """A window of an image, resized and turned for a point matcher.
 
     window: whole pixels inside the image. size: (width, height) in the matcher's pixels, as it sees them. turns:
-    quarter turns anticlockwise, 0 to 3. The resize is isotropic up to the rounding of `size`; `crop_from_image` is the
-    exact affine map of what `pixels` returns.
+    quarter turns anticlockwise, 0 to 3. alike: things have one size in both crops of the pair, as far as an earlier
+    round tells, so that a matcher which looks at several sizes may do with one. The resize is isotropic up to the
+    rounding of `size`; `crop_from_image` is the exact affine map of what `pixels` returns.
     """
 
     image: Image
     window: Box
     size: tuple[int, int]
     turns: int = 0
+    alike: bool = False
 
     @property
     def key(self) -> tuple[str | float, ...]:
         """Equal for crops with equal content: what a matcher may cache features by, within one collection."""
         w = self.window
-        return (self.image.name, w.x0, w.y0, w.x1, w.y1, *self.size, self.turns)
+        return (self.image.name, w.x0, w.y0, w.x1, w.y1, *self.size, self.turns, self.alike)
 
     @property
     def scale(self) -> float:
@@ -202,7 +204,7 @@ class WarpedCrop(Crop):
     @property
     def key(self) -> tuple[str | float, ...]:
         w = self.window
-        return (self.image.name, w.x0, w.y0, w.x1, w.y1, *self.size, *self.image_from_crop)
+        return (self.image.name, w.x0, w.y0, w.x1, w.y1, *self.size, *self.image_from_crop, self.alike)
 
     @property
     def scale(self) -> float:
@@ -258,7 +260,10 @@ def _turned_about_its_centre(crop: Crop, degrees: int) -> WarpedCrop:
     linear = cv2.invertAffineTransform(crop.crop_from_image)[:, :2] @ [[cosine, -sine], [sine, cosine]]
     [centre] = crop.to_image(np.array([[width / 2, height / 2]]))
     affine = np.column_stack([linear, centre - linear @ size / 2])
-    return WarpedCrop(image=crop.image, window=crop.window, size=size, image_from_crop=tuple(affine.ravel().tolist()))
+    image_from_crop = tuple(affine.ravel().tolist())
+    return WarpedCrop(
+        image=crop.image, window=crop.window, size=size, alike=crop.alike, image_from_crop=image_from_crop
+    )
 
 
 def _resize(array: np.ndarray, size: tuple[int, int], *, smooth: bool) -> np.ndarray:

@@ -146,8 +146,8 @@ class MatchOptions:
     device: str = "auto"
     """auto, cpu, cuda, cuda:1, ..."""
     precision: Precision = "auto"
-    """Of the networks of xfeat-star and loftr: half, 16 bits, faster on CUDA only; full, 32 bits; auto: half on CUDA.
-    Other matchers have no choice."""
+    """Of the networks of xfeat-star and loftr: half, 16 bits, faster on CUDA only; full, 32 bits; auto: half on CUDA,
+    and what gains from it (offsets of xfeat-star) on CPUs with bfloat16. Other matchers have no choice."""
     threads: int = 0
     """CPU threads (0: all cores)."""
     worker_timeout: float = 600.0

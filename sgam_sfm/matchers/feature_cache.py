@@ -26,10 +26,10 @@ F = TypeVar("F", bound=Sized)
 class FeatureCache(Generic[F]):
     """Features by crop; the least recently used are dropped first.
 
-    Crops of equal size are extracted together, `batch_size` at most.
+    Crops of equal size that are alike, or are not, are extracted together, `batch_size` at most.
 
     Args:
-        extract: the features of crops of one size.
+        extract: the features of crops of one size, all alike or none.
         batch_size: crops that are extracted together.
         max_bytes: bound of what is kept; the last crop is kept whatever it takes.
 
@@ -65,12 +65,12 @@ class FeatureCache(Generic[F]):
 
     def fetch(self, crops: Sequence[Crop]) -> None:
         """Extract those that are not kept yet, in batches of equal size."""
-        by_size: dict[tuple[int, int], dict[tuple, Crop]] = {}
+        by_kind: dict[tuple, dict[tuple, Crop]] = {}
         for crop in crops:
             if crop.key not in self._kept:
-                by_size.setdefault(crop.size, {})[crop.key] = crop
-        for same_size in by_size.values():
-            missing = list(same_size.values())
+                by_kind.setdefault((crop.size, crop.alike), {})[crop.key] = crop
+        for same_kind in by_kind.values():
+            missing = list(same_kind.values())
             for start in range(0, len(missing), self.batch_size):
                 self._add(missing[start : start + self.batch_size])
 

@@ -1,6 +1,6 @@
 """XFeat*: semi-dense matching of learned features at two scales, on kornia's model (Potje et al., CVPR 2024).
 
-Follows the paper's semi-dense mode with five differences, each measured:
+Follows the paper's semi-dense mode with six differences, each measured:
 - every crop is resized once per scale (not twice), so that a cell of the network is an exact affine map of crop pixels;
 - descriptors are normalised before they are compared;
 - the offset inside a cell is calibrated and applied to both sides. The network predicts where the reference point of
@@ -8,6 +8,7 @@ Follows the paper's semi-dense mode with five differences, each measured:
   sixth. Asked both ways it gives two correspondences of one cell pair; their midpoint is again a correspondence of a
   locally affine map, with less noise, no bias, and no preference for one of the images;
 - fewer of the features come from the coarse scale, whose cells cover 13 pixels;
+- crops that are alike, in which things have one size, are seen at one scale;
 - where the patches of a match look alike, they decide the last half pixel.
 """
 
@@ -27,7 +28,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sgam_core.errors import OptionError
 from sgam_core.types import Crop, Matches
-from sgam_sfm.machine import Precision, find_device, runs_half
+from sgam_sfm.machine import Precision, find_device, multiplies_bfloat16, runs_half
 from sgam_sfm.matchers.feature_cache import FeatureCache
 from sgam_sfm.matchers.masks import wanted
 from sgam_sfm.matchers.sparse import batch_size as together
@@ -81,9 +82,11 @@ class XFeatStar:
     Args:
         weights: the model file; found by itself when omitted.
         device: a torch device, such as `cpu` or `cuda:0`.
-        precision: of the network; `auto`: half on CUDA, full elsewhere.
+        precision: of the network; `auto`: half on CUDA, elsewhere full, but for offsets in bfloat16 on CPUs that
+            multiply such numbers faster.
         features_per_megapixel: how many cells of a crop are kept, by reliability.
         scales: the two sizes at which a crop is seen, as factors of its own.
+        alike_scale: the one size at which crops are seen that are alike.
         coarse_share: share of the features that comes from the first scale; 0 for the second scale alone.
         min_confidence: both offset confidences of a match exceed it; 0 disables.
         min_cosine: the descriptors' cosine exceeds it; -1 disables.
@@ -105,6 +108,7 @@ class XFeatStar:
         precision: Precision = "auto",
         features_per_megapixel: int = 12_000,
         scales: tuple[float, float] = (0.6, 1.3),
+        alike_scale: float = 1.15,
         coarse_share: float = 0.1,
         min_confidence: float = 0.25,
         min_cosine: float = 0.8,
@@ -116,12 +120,13 @@ class XFeatStar:
             raise OptionError(f"coarse_share is {coarse_share}; expected at least 0 and less than 1")
         if features_per_megapixel < 1:
             raise OptionError(f"features_per_megapixel is {features_per_megapixel}; expected at least 1")
-        if min(scales) <= 0:
-            raise OptionError(f"scales are {scales}; expected two positive factors")
+        if min(*scales, alike_scale) <= 0:
+            raise OptionError(f"scales are {scales} and alike_scale is {alike_scale}; expected positive factors")
         self.device = find_device(device)
         self._half = runs_half(precision, self.device)
         self.features_per_megapixel = features_per_megapixel
         self.shares = ((scales[0], coarse_share), (scales[1], 1 - coarse_share))
+        self.alike_scale = alike_scale
         self.min_confidence = min_confidence
         self.min_cosine = min_cosine
         self.photometric = photometric
@@ -129,6 +134,9 @@ class XFeatStar:
             self._extract, batch_size=together(self.device, batch_size), max_bytes=cache_bytes
         )
         self._net = load_xfeat(find_weights(XFEAT, weights), sparse=False).to(self.device)
+        bfloat16 = precision == "auto" and multiplies_bfloat16(self.device)
+        self._offset_type = torch.bfloat16 if bfloat16 else torch.float32
+        self._net.fine_matcher.to(self._offset_type)
 
     @property
     def pixels_extracted(self) -> int:
@@ -167,12 +175,13 @@ class XFeatStar:
         return aligned(crop0, crop1, matches, (features0.gray, features1.gray)) if self.photometric else matches
 
     def _extract(self, crops: Sequence[Crop]) -> list[_Features]:
-        """The features of crops of one size, which go through the network together."""
+        """The features of crops of one size, all alike or none, which go through the network together."""
         width, height = crops[0].size
         pixels = [crop.pixels() for crop in crops]
         gray = torch.stack([torch.from_numpy(each).to(self.device).float().mean(-1) for each in pixels])
         budget = max(MIN_FEATURES, round(self.features_per_megapixel * width * height / 1e6))
-        scales = [self._extract_at(scale, round(share * budget), gray, crops) for scale, share in self.shares if share]
+        shares = ((self.alike_scale, 1.0),) if crops[0].alike else self.shares
+        scales = [self._extract_at(scale, round(share * budget), gray, crops) for scale, share in shares if share]
         found = []
         for own, parts in zip(pixels, zip(*scales, strict=True), strict=True):
             descriptors, centers, steps = (torch.cat(of_scales) for of_scales in zip(*parts, strict=True))
@@ -200,7 +209,8 @@ class XFeatStar:
 
     def _offsets(self, here: _Features, there: _Features) -> tuple[Tensor, Tensor]:
         """Where the cell centres `there` lie `here`: (M, 2) crop pixels from the centre, and (M,) confidences."""
-        logits = self._net.fine_matcher(torch.cat([here.descriptors, there.descriptors], 1))
+        descriptors = torch.cat([here.descriptors, there.descriptors], 1).to(self._offset_type)
+        logits = self._net.fine_matcher(descriptors).float()
         shares = (SOFTMAX_TEMPERATURE * logits).softmax(-1)
         bins = torch.arange(CELL, device=self.device) - (CELL - 1) / 2
         by_row = shares.view(-1, CELL, CELL)

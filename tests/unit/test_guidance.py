@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from sgam_core.covisible import Frame
 from sgam_core.geometry import estimate_two_view
 from sgam_core.guidance import guided_areas, warp_between
 from sgam_core.options import CropOptions, GuidanceOptions, changed
-from sgam_core.types import Area, AreaMatch, AreaState, Box, Matches
+from sgam_core.types import Area, AreaMatch, AreaState, Box, Crop, Matches
 from tests.room import Room, TrueMatcher
 
 FRAME = Frame(name="a", width=3000, height=2000, camera_matrix=None)
@@ -166,6 +166,27 @@ def test_images_that_agree_are_looked_at_again_more_finely(room):
     fine = found.matches.area_index >= 0
     assert fine.mean() > 0.5
     assert found.fallback == ""
+
+
+@dataclass(frozen=True)
+class Noting(TrueMatcher):
+    """Remembers the crops that it is given."""
+
+    seen: list[tuple[Crop, Crop]] = field(default_factory=list)
+
+    def match(self, pairs):
+        self.seen.extend(pairs)
+        return super().match(pairs)
+
+
+@pytest.mark.parametrize("max_bend", [0.0, 0.05])
+def test_only_crops_whose_size_was_measured_are_said_to_be_alike(room, max_bend):
+    matcher = Noting(room)
+    found = in_room(room, changed(COARSE, guidance__max_bend=max_bend), point_matcher=matcher)
+    whole, *guided = matcher.seen
+    assert not any(crop.alike for crop in whole)
+    assert len(guided) == len(found.areas) > 0
+    assert all(crop.alike for pair in guided for crop in pair)
 
 
 def test_images_without_more_resolution_cost_what_they_cost_plainly(room):

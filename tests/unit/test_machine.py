@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sgam_core.errors import OptionError
-from sgam_sfm.machine import runs_half, use_threads
+from sgam_sfm.machine import multiplies_bfloat16, runs_half, use_threads
 
 
 def test_all_threads_are_used_again_after_a_run_with_one():
@@ -33,6 +33,20 @@ def test_half_precision_is_for_cuda(precision, device, expected):
 def test_half_precision_on_the_cpu_is_refused():
     with pytest.raises(OptionError, match=r"^--precision half: on the CPU networks take .* leave it out, or give "):
         runs_half("half", torch.device("cpu"))
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "device", "expected"),
+    [
+        ({"avx512_bf16": True}, "cpu", True),
+        ({"avx512_bf16": False, "amx_bf16": True}, "cpu", True),
+        ({"avx512_bf16": False, "avx2": True}, "cpu", False),
+        ({"avx512_bf16": True}, "cuda", False),
+    ],
+)
+def test_bfloat16_is_for_cpus_that_have_instructions_for_it(monkeypatch, capabilities, device, expected):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
+    assert multiplies_bfloat16(torch.device(device)) is expected
 
 
 def test_less_than_no_thread_is_refused():

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -54,6 +56,39 @@ def test_coordinates_are_unbiased_at_odd_sizes_and_changes_of_scale(matcher, mon
             found.append(transfer(warp, matches.points0) - matches.points1)
     assert np.abs(np.median(np.concatenate(errors[False]), axis=0)).max() < bound
     assert np.abs(np.median(np.concatenate(errors[True]), axis=0)).max() < 0.02
+
+
+@pytest.mark.parametrize(("size", "scale"), [((333, 251), 1.0), ((251, 317), 1.1)])
+def test_crops_that_are_alike_are_seen_at_one_scale_and_matched_as_exactly(matcher, size, scale):
+    warp = similarity(scale, 5, (2.2, 5.9), (size[0] / 2, size[1] / 2))
+    pair = whole(view(np.eye(3), size), "first"), whole(view(warp, size), "second")
+    alike = replace(pair[0], alike=True), replace(pair[1], alike=True)
+    matches, fewer = matcher.match([pair, alike])
+    steps = [len(matcher.features.of(crop).steps.unique(dim=0)) for crop in (*pair, *alike)]
+    assert steps == [2, 2, 1, 1]
+    errors = [
+        np.linalg.norm(transfer(warp, found.points0) - found.points1, axis=1).clip(max=3) for found in (matches, fewer)
+    ]
+    assert len(fewer) > 0.8 * len(matches)
+    assert errors[1].mean() < 1.1 * errors[0].mean()
+
+
+def test_offsets_in_bfloat16_are_those_in_full_precision(monkeypatch):
+    warp = similarity(1.0, 5, (2.2, 5.9), (160, 120))
+    pair = whole(view(np.eye(3), (320, 240)), "first"), whole(view(warp, (320, 240)), "second")
+    found = []
+    for bfloat16 in (False, True):
+        monkeypatch.setattr(xfeat, "multiplies_bfloat16", lambda _, known=bfloat16: known)
+        found += XFeatStar(photometric=False).match([pair])
+    full, half = (
+        {tuple(np.round(points0 / 4)): points1 for points0, points1 in zip(each.points0, each.points1, strict=True)}
+        for each in found
+    )
+    both = full.keys() & half.keys()
+    assert len(both) > 0.8 * len(full)
+    apart = np.array([np.linalg.norm(full[place] - half[place]) for place in both])
+    assert np.median(apart) < 0.05
+    assert np.quantile(apart, 0.9) < 0.2
 
 
 def test_alignment_makes_matches_three_times_as_precise(matcher, monkeypatch):
@@ -144,7 +179,7 @@ def test_mutual_nearest_is_the_same_in_one_block_or_in_many(monkeypatch):
     [
         ({"coarse_share": 1.0}, "coarse_share is 1.0; expected at least 0 and less than 1"),
         ({"features_per_megapixel": 0}, "features_per_megapixel is 0; expected at least 1"),
-        ({"scales": (0.0, 1.3)}, "scales are (0.0, 1.3); expected two positive factors"),
+        ({"scales": (0.0, 1.3)}, "scales are (0.0, 1.3) and alike_scale is 1.15; expected positive factors"),
     ],
 )
 def test_wrong_settings_are_named(settings, message):
