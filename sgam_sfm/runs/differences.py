@@ -22,6 +22,13 @@ def difference(there: Told, here: Told) -> str:
     return ", ".join(changed or [*_images(there[1], here[1]), *_pairs(there[1], here[1])]) or "cameras"
 
 
+def goes_on(there: Told, here: Told) -> bool:
+    """Whether the same is matched here, and more pairs."""
+    images_there, images_here = (inputs.get("images", {}).items() for _, inputs in (there, here))
+    pairs_there, pairs_here = (set(map(tuple, inputs.get("pairs", ()))) for _, inputs in (there, here))
+    return _flags(there[0]) == _flags(here[0]) and images_there <= images_here and pairs_there < pairs_here
+
+
 def _images(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
     before, now = (inputs.get("images", {}) for inputs in (there, here))
     changed = {name for name in before.keys() & now.keys() if before[name] != now[name]}

@@ -25,7 +25,7 @@ from sgam_sfm.pairs import Pair, blocks
 from sgam_sfm.progress import Stages
 from sgam_sfm.runs.assembly import build_models, merged_records, verify_pairs, write_for_hloc
 from sgam_sfm.runs.block_matching import count_outcomes, match_blocks
-from sgam_sfm.runs.differences import difference
+from sgam_sfm.runs.differences import difference, goes_on
 from sgam_sfm.runs.matching import create_area_matcher, special_labels
 from sgam_sfm.runs.results import json_object
 from sgam_sfm.runs.run_record import recording
@@ -202,7 +202,7 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
     Raises: OptionError when OUT was begun with others, naming them, or holds another shard.
     """
     mark = fingerprint_of(options, inputs)
-    path = options.output / "options.json"
+    path, database = options.output / "options.json", options.output / "database.db"
     now, known = as_json(options) | {"fingerprint": mark}, _as_json(inputs)
     if path.exists():
         before = json_object(path)
@@ -210,8 +210,14 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
             _log.warning("'%s' is damaged, and is written anew", path)
         if before.get("fingerprint") != mark:
             if before and stored_files(options.output):
-                other = difference((before, json_object(options.output / "inputs.json")), (now, known))
-                raise OptionError(f"'{options.output}' was begun with other {other}; choose a new --output folder")
+                there, here = (before, json_object(options.output / "inputs.json")), (now, known)
+                told = (
+                    f"'{options.output}' was begun with other {difference(there, here)}; choose a new --output folder"
+                )
+                later = goes_on(there, here) and database.is_file()
+                raise OptionError(
+                    told + (f", and list the later pairs alone, with --database {database}" if later else "")
+                )
             (options.output / "labels" / RECORD).unlink(missing_ok=True)  # they follow from the options too
         other = before.get("shard", "")
         if options.shard and other not in ("", options.shard):

@@ -112,7 +112,28 @@ def test_other_options_need_another_folder(folder, finished, capsys):
     assert cli.run(arguments(folder, finished, "--area-size", "320")) == USAGE
     error = " ".join(capsys.readouterr().err.split())
     assert "was begun with other --area-size (800 there, 320 here)" in error
-    assert "choose a new --output folder" in error
+    assert error.endswith("choose a new --output folder")
+
+
+def test_photos_that_came_later_are_matched_into_the_database(folder, tmp_path, capsys):
+    shutil.copytree(folder, more := tmp_path / "more")
+    pairs, database = more / "pairs.txt", tmp_path / "out" / "database.db"
+    (later := more / "images" / "view06.jpg").rename(hidden := tmp_path / "view06.jpg")
+    pairs.write_text("view03.jpg view04.jpg\nview04.jpg view05.jpg\n")
+    assert cli.run(arguments(more, tmp_path / "out")) == DONE
+    before = database_content(database)
+
+    hidden.rename(later)
+    pairs.write_text(pairs.read_text() + "view05.jpg view06.jpg\n")
+    assert cli.run(arguments(more, tmp_path / "out")) == USAGE
+    error = " ".join(capsys.readouterr().err.split())
+    assert "was begun with other images (1 only here, 'view06.jpg' for one), pairs (1 only here," in error
+    assert error.endswith(f"new --output folder, and list the later pairs alone, with --database {database}")
+
+    pairs.write_text("view05.jpg view06.jpg\n")
+    assert cli.run(arguments(more, tmp_path / "out2", "--database", str(database))) == DONE
+    after = database_content(database)
+    assert len(after["two_view_geometries"]) == len(before["two_view_geometries"]) + 1 == 3
 
 
 def test_options_of_a_run_are_a_config_and_flags_win_over_them(folder, finished, tmp_path):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sgam_sfm.runs.differences import difference
+from sgam_sfm.runs.differences import difference, goes_on
 
 INPUTS = {"images": {"a.jpg": "1", "b.jpg": "2"}, "pairs": [["a.jpg", "b.jpg"]]}
 
@@ -32,3 +32,21 @@ def run(options=None, **inputs):
 )
 def test_what_differs_is_named(here, told):
     assert difference(run(), here) == told
+
+
+MORE = {"images": INPUTS["images"] | {"c.jpg": "3"}, "pairs": [*INPUTS["pairs"], ["b.jpg", "c.jpg"]]}
+
+
+@pytest.mark.parametrize(
+    ("here", "expected"),
+    [
+        (run(**MORE), True),
+        (run(pairs=[*INPUTS["pairs"], ["b.jpg", "a.jpg"]]), True),
+        (run(), False),  # cameras
+        (run({"matcher": "loftr"}, **MORE), False),
+        (run(**(MORE | {"pairs": [["b.jpg", "c.jpg"]]})), False),
+        (run(**(MORE | {"images": {"a.jpg": "3", "b.jpg": "2", "c.jpg": "3"}})), False),
+    ],
+)
+def test_a_run_of_the_same_and_more_is_told_from_another_one(here, expected):
+    assert goes_on(run(), here) is expected
