@@ -25,6 +25,7 @@ from sgam_core.rejection import reject
 from sgam_core.semantic import SemanticAreaMatcher
 from sgam_core.support import supported
 from sgam_core.types import AreaState, Image, Matches, PairResult, PutativeAreas, TwoViewModel
+from sgam_core.uniqueness import without_contradictions
 
 
 def match_pair(
@@ -196,7 +197,7 @@ def _guided(first: _Found, points: PairPoints, estimate: Estimate, options: SGAM
     if not proposed:
         return None
     warps = [warp_between(agreeing, area, options.guidance) for area in proposed]
-    looked = points.guided(proposed, warps)
+    looked = without_contradictions(points.guided(proposed, warps))
     verdict = reject(looked, points.whole, True, estimate, options.geometry, options.rejection)
     if verdict.fallback:
         return None
