@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float
 from kornia.feature.xfeat import XFeatModel
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, normalize
+from torch.nn.functional import interpolate, normalize, pad
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sgam_core.errors import OptionError
@@ -39,6 +39,7 @@ from sgam_sfm.weights import XFEAT, find_weights
 CELL = 8  # pixels of the network's input per cell
 MULTIPLE = 32  # the input's width and height are multiples of this
 SOFTMAX_TEMPERATURE = 3.0  # of the 8 x 8 offset logits, as published
+OFFSET_ROWS = 256  # matches go through the network by multiples: torch keeps code in memory for each different number
 OFFSET_GAIN = 1.2  # true offset over expected offset: regressed on warps with exact ground truth
 MIN_FEATURES = 64  # of a crop, however small
 
@@ -210,7 +211,8 @@ class XFeatStar:
     def _offsets(self, here: _Features, there: _Features) -> tuple[Tensor, Tensor]:
         """Where the cell centres `there` lie `here`: (M, 2) crop pixels from the centre, and (M,) confidences."""
         descriptors = torch.cat([here.descriptors, there.descriptors], 1).to(self._offset_type)
-        logits = self._net.fine_matcher(descriptors).float()
+        filled = pad(descriptors, (0, 0, 0, -len(descriptors) % OFFSET_ROWS))
+        logits = self._net.fine_matcher(filled)[: len(descriptors)].float()
         shares = (SOFTMAX_TEMPERATURE * logits).softmax(-1)
         bins = torch.arange(CELL, device=self.device) - (CELL - 1) / 2
         by_row = shares.view(-1, CELL, CELL)
