@@ -8,52 +8,52 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from sgam_core.prediction import MatchedArea
-from sgam_core.types import AreaState, Box
+from sgam_core.types import AreaState, Box, Matches
 
-_FEWEST = 8  # matches that tell where an area puts a place
-_SHARED = 0.25  # share of an area's matches on the ground of another one, from which on the two can be compared
-_APART = 0.25  # of an area's long side: so far apart, two places are not one
+_FEWEST = 8  # points beside those of other areas that tell whether these put the place elsewhere
+_SHARED = 0.25  # and their share of all
+_BESIDE = 0.05  # of an area's long side: so near, two points show one place
+_APART = 0.25  # of an area's long side: so far apart, they do not
 
 
 def without_contradictions(areas: Sequence[MatchedArea]) -> list[MatchedArea]:
-    """The areas, those rejected that put what an area with more matches shows elsewhere, in either image."""
-    judged = list(areas)
-    trusted: list[MatchedArea] = []
+    """The areas, those rejected that put what areas with more matches show elsewhere, in either image."""
+    judged, trusted = list(areas), Matches.empty()
     for row in sorted(range(len(areas)), key=lambda row: (-len(areas[row].matches), row)):
         area = areas[row]
         if area.area.state is not AreaState.KEPT:
             continue
-        if any(_contradict(area, other) or _contradict(other, area) for other in trusted):
-            judged[row] = area.resolved(AreaState.REJECTED, "an area with more matches puts the same ground elsewhere")
+        if _contradicts(area, trusted):
+            judged[row] = area.resolved(AreaState.REJECTED, "areas with more matches put the same ground elsewhere")
         else:
-            trusted.append(area)
+            trusted = Matches.concatenate([trusted, area.matches])
     return judged
 
 
-def _contradict(area: MatchedArea, other: MatchedArea) -> bool:
-    """Whether, in either image, many of an area's points lie in the other one, which puts them elsewhere."""
-    here, there = (area.matches.points0, area.matches.points1), (other.matches.points0, other.matches.points1)
-    boxes = other.area.area0.box, other.area.area1.box
+def _contradicts(area: MatchedArea, trusted: Matches) -> bool:
+    here, there = (area.matches.points0, area.matches.points1), (trusted.points0, trusted.points1)
+    boxes = area.area.area0.box, area.area.area1.box
     return _elsewhere(here, there, boxes) or _elsewhere(here[::-1], there[::-1], boxes[::-1])
 
 
-def _elsewhere(here: Sequence[np.ndarray], there: Sequence[np.ndarray], boxes: Sequence[Box]) -> bool:
-    """Whether points of one area that lie in another one are put elsewhere than that one's own points.
+def _elsewhere(
+    here: Sequence[Float[np.ndarray, "_ 2"]], there: Sequence[Float[np.ndarray, "_ 2"]], boxes: Sequence[Box]
+) -> bool:
+    """Whether most of an area's points that lie beside others in one image are apart from them in the other one.
 
-    Args: here, there: (N, 2) and (M, 2) points of both areas, in one image and in the other. boxes: of the second area.
+    Args: here, there: points of the area and those others, in the one image and in the other. boxes: the area's.
     """
-    shared = boxes[0].contains(here[0])
-    if shared.sum() < max(_FEWEST, _SHARED * len(here[0])) or len(there[0]) < _FEWEST:
+    if not len(there[0]):
         return False
-    affine, _ = cv2.estimateAffine2D(there[0], there[1], method=cv2.LMEDS)
-    if affine is None or not np.isfinite(affine).all():
+    near, far = (share * max(box.width, box.height) for share, box in zip((_BESIDE, _APART), boxes, strict=True))
+    distances, nearest = cKDTree(there[0]).query(here[0])
+    beside = distances < near
+    if beside.sum() < max(_FEWEST, _SHARED * len(here[0])):
         return False
-    off: Float[np.ndarray, " N"] = np.linalg.norm(
-        here[0][shared] @ affine[:, :2].T + affine[:, 2] - here[1][shared], axis=1
-    )
-    return bool(np.median(off) > _APART * max(boxes[1].width, boxes[1].height))
+    off = np.linalg.norm(here[1][beside] - there[1][nearest[beside]], axis=1)
+    return bool(np.median(off) > far)

@@ -45,7 +45,7 @@ def test_one_that_is_a_window_further_is_rejected_whatever_the_order(order, shif
     areas = [area(0, 0, count=90), area(150, 30, count=80, seed=1), area(20, 10, shift=shift), area(600, 0, seed=2)]
     judged = without_contradictions([areas[row] for row in order])
     assert [each.area.state is AreaState.KEPT for each in judged] == [row != 2 for row in order]
-    assert {each.area.reason for each in judged} == {"", "an area with more matches puts the same ground elsewhere"}
+    assert {each.area.reason for each in judged} == {"", "areas with more matches put the same ground elsewhere"}
 
 
 def test_two_places_of_one_image_are_not_one_place_of_the_other():
