@@ -9,7 +9,8 @@ then whole images again, so that what slows the machine down slows down all. Onl
 machine. Prints a Markdown table and, last, a line of JSON. OUT/bench is begun anew.
 
 The plain matcher extracts features once an image and block, areas are extracted once a pair: `Mpx extracted` beside
-`Mpx matched` says how much of the time per pixel follows from that.
+`Mpx matched` says how much of the time per pixel follows from that. Where several pairs are matched at once, the
+seconds of a stage are those of all threads; `extracting` is part of what whole images and areas take.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -43,7 +45,7 @@ from sgam_sfm.machine import find_device, use_threads
 from sgam_sfm.options import MatchOptions, with_preset
 from sgam_sfm.pairs import Pair, PairList, blocks, spread_over
 from sgam_sfm.progress import Stages
-from sgam_sfm.runs.matching import CollectionMatcher, create_area_matcher, create_matcher, reset
+from sgam_sfm.runs.matching import CollectionMatcher, create_area_matcher, create_matcher, is_concurrent, reset
 from sgam_sfm.runs.runner import assemble, open_store
 from sgam_sfm.runs.store import PairRecord
 from sgam_sfm.runs.summary import versions
@@ -60,13 +62,19 @@ REST = ("Merging keypoints", "Verifying pairs", "Mapping")
 
 @dataclass
 class TimedMatcher:
-    """A point matcher whose seconds are told apart: of whole images and of areas, and of extracting features.
+    """A point matcher whose seconds, of all threads, are told apart: of whole images and of areas.
 
     It never says that it is repeatable, so that every block, which some variants match twice, begins without features.
     """
 
     matcher: PointMatcher
     seconds: Counter[str] = field(default_factory=Counter)
+    lock: Lock = field(default_factory=Lock)
+
+    @property
+    def concurrent(self) -> bool:
+        """Whether threads may match at once."""
+        return is_concurrent(self.matcher)
 
     def reset(self) -> None:
         """Forget what the point matcher has in memory."""
@@ -74,13 +82,13 @@ class TimedMatcher:
 
     def match(self, pairs: Sequence[tuple[Crop, Crop]]) -> list[Matches]:
         """Match every pair of crops; see `PointMatcher.match`."""
-        start, before = time.perf_counter(), self._extracting
+        start = time.perf_counter()
         found = self.matcher.match(pairs)
+        seconds = time.perf_counter() - start
         whole = all(_is_whole(crop.image, crop) for pair in pairs for crop in pair)
-        extracting = self._extracting - before
-        rest = "matching whole images" if whole else "matching areas"
-        self.seconds["extracting"] += extracting  # type: ignore[assignment]  # typeshed's counters count whole things
-        self.seconds[rest] += time.perf_counter() - start - extracting  # type: ignore[assignment]
+        with self.lock:
+            # typeshed's counters count whole things
+            self.seconds["whole images matched" if whole else "areas matched"] += seconds  # type: ignore[assignment]
         return found
 
     @property
@@ -89,7 +97,8 @@ class TimedMatcher:
         return getattr(self.matcher, "pixels_extracted", 0)
 
     @property
-    def _extracting(self) -> float:
+    def extracting(self) -> float:
+        """Seconds of the above that went into features."""
         return getattr(getattr(self.matcher, "features", None), "seconds_extracting", 0.0)
 
 
@@ -115,8 +124,7 @@ class Variant:
     def match(self, number: int, block: Sequence[Pair]) -> None:
         """Match a block, timed."""
         start = time.perf_counter()
-        with self.collection.block(block):
-            records = [self.collection.match(pair) for pair in block]
+        records = [record for _, record in self.collection.match_blocks([(number, block)], lambda _: None)]
         self.wall.append(time.perf_counter() - start)
         self.records[number] = records
         for result in results_of(records):
@@ -129,7 +137,8 @@ class Variant:
 
     def figures(self) -> dict[str, float]:
         """Seconds by stage of one pass over all pairs, their sum as measured, and pixels."""
-        stages = {stage: s / self.rounds for stage, s in (self.seconds + self.timed.seconds).items()}
+        seconds = {**self.seconds, **self.timed.seconds, "extracting": self.timed.extracting}
+        stages = {stage: s / self.rounds for stage, s in seconds.items()}
         told = {"matching pairs": sum(self.wall) / self.rounds}
         pixels = {"Mpx matched": self.pixels / 1e6, "Mpx extracted": self.timed.pixels_extracted / 1e6 / self.rounds}
         return stages | told | pixels
@@ -177,8 +186,7 @@ def measured(options: MatchOptions, presets: Sequence[str], num_pairs: int) -> d
     once["describing an image"] = _describing(options, inputs, labels)
     work = blocks(chosen, options.block_images)
     for variant in variants.values():  # what is loaded at the first call is not timed
-        with variant.collection.block(work[0]):
-            variant.collection.match(work[0][0])
+        variant.collection.match(work[0][0])
         variant.timed.seconds.clear()
         _forget_extracted(variant.timed.matcher)
     for number, block in enumerate(work):
@@ -326,7 +334,7 @@ def table(figures: Mapping[str, Mapping[str, float]], once: Mapping[str, float])
     """Markdown: a row a stage; seconds, and in parentheses the ratio to plain's matching."""
     first = next(iter(figures.values()))["matching pairs"]
     rows = [["stage", *figures], ["---"] * (len(figures) + 1)]
-    names = ["extracting", "matching whole images", "matching areas", *PAIR_STAGES, "matching pairs", *REST]
+    names = ["whole images matched", "areas matched", "extracting", *PAIR_STAGES, "matching pairs", *REST]
     for stage in names:
         values = [each.get(stage, 0.0) for each in figures.values()]
         rows.append([f"{stage}, s", *(f"{value:.2f} ({value / first:.3f})" for value in values)])

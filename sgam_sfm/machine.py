@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -69,6 +70,22 @@ def use_threads(number: int) -> None:
     for_torch, for_opencv = _default_threads()
     torch.set_num_threads(number or for_torch)
     cv2.setNumThreads(number or for_opencv)
+
+
+@contextmanager
+def single_threads() -> Iterator[int]:
+    """Torch and OpenCV use one thread for whoever calls them inside. Yields: how many torch used before."""
+    import cv2
+    import torch
+
+    for_torch, for_opencv = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        yield for_torch
+    finally:
+        torch.set_num_threads(for_torch)
+        cv2.setNumThreads(for_opencv)
 
 
 @cache

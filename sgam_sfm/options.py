@@ -149,7 +149,7 @@ class MatchOptions:
     """Of the networks of xfeat-star and loftr: half, 16 bits, faster on CUDA only; full, 32 bits; auto: half on CUDA,
     and what gains from it (offsets of xfeat-star) on CPUs with bfloat16. Other matchers have no choice."""
     threads: int = 0
-    """CPU threads (0: all cores)."""
+    """CPU threads (0: all cores). xfeat-star and sparse matchers match as many pairs at once on the CPU, 16 at most."""
     worker_timeout: float = 600.0
     """Seconds that a script of yours, or vismatch, may take to start, or for a pair or an image."""
     seed: int = 0

@@ -6,6 +6,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from threading import Lock
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -13,7 +14,7 @@ _AHEAD = 2  # that the thread has been asked for, one of which it reads
 
 
 class ReadAhead(Generic[T]):
-    """Values by name; the least recently used are dropped first.
+    """Values by name; the least recently used are dropped first. Threads may ask at once.
 
     The thread changes nothing but the time at which a value is read: one that it fails to read is read again when it is
     asked for, and raises what it raises then.
@@ -30,32 +31,38 @@ class ReadAhead(Generic[T]):
         self._planned: frozenset[str] = frozenset()
         self._asked: dict[str, Future[T]] = {}
         self._thread: ThreadPoolExecutor | None = None
+        self._lock = Lock()
 
     def __call__(self, name: str) -> T:
         """The value of a name, read now when it is not there. Raises: what reading it raises."""
-        if name not in self._kept:
-            if name in self._coming:
-                self._coming.remove(name)
-            self._kept[name] = self._arrived(name)
-        self._kept.move_to_end(name)
-        self._ask()
-        return self._kept[name]
+        with self._lock:
+            if name not in self._kept:
+                if name in self._coming:
+                    self._coming.remove(name)
+                self._kept[name] = self._arrived(name)
+            self._kept.move_to_end(name)
+            value = self._kept[name]
+            self._ask()  # drops it where it is not of this plan, but of the one before
+            return value
 
     @contextmanager
     def ahead(self, names: Iterable[str]) -> Iterator[None]:
         """Read ahead what will be asked for inside, in the order of the names; repeated ones are read once."""
-        self._planned = frozenset(plan := dict.fromkeys(names))
-        self._coming = deque(name for name in plan if name not in self._kept)
-        with ThreadPoolExecutor(max_workers=1, thread_name_prefix="read ahead") as self._thread:
-            try:
-                yield
-            finally:
+        with self._lock:
+            self._planned = frozenset(plan := dict.fromkeys(names))
+            self._coming = deque(name for name in plan if name not in self._kept)
+            self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="read ahead")
+        try:
+            yield
+        finally:
+            with self._lock:
                 self._stop()
 
     def clear(self) -> None:
         """Forget all, and read nothing ahead until the next plan."""
-        self._stop()
-        self._kept.clear()
+        with self._lock:
+            self._stop()
+            self._kept.clear()
 
     def _arrived(self, name: str) -> T:
         if name in self._asked:

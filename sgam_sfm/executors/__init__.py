@@ -50,7 +50,7 @@ class Executor(Protocol):
 
         Blocks come in any order, the pairs of each in their own, every pair once.
 
-        Args: begin is told, where a crash would end this process, which pair is next.
+        Args: begin is told, where a crash would end this process, which pair is next, if it is matched alone.
         Raises: OptionError when the options ignore or mask a label that is none.
         """
         ...

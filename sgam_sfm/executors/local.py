@@ -1,4 +1,4 @@
-"""Blocks of pairs matched by this process, one after the other."""
+"""Blocks of pairs matched by this process, one block after the other."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from sgam_sfm.executors import Begin, MatchingJob
 from sgam_sfm.machine import find_device, use_threads
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
-from sgam_sfm.runs.matching import CollectionMatcher, create_matcher, failed_record
+from sgam_sfm.runs.matching import CollectionMatcher, create_matcher
 from sgam_sfm.runs.store import PairRecord
-from sgam_sfm.runs.supervised import given_up
+from sgam_sfm.runs.supervised import crashes
+
+_BLOCKS_AT_ONCE = 2  # the end of one and the beginning of the next
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -39,12 +41,18 @@ class LocalExecutor:
         self, job: MatchingJob, blocks: Sequence[tuple[int, Sequence[Pair]]], begin: Begin
     ) -> Iterator[tuple[int, Sequence[PairRecord]]]:
         matcher = CollectionMatcher(job.options, job.inputs, job.labels, self.point_matcher)
-        for number, block in blocks:
-            with matcher.block(block):
-                for pair in block:
-                    begin(pair)
-                    reason = given_up(pair)
-                    yield number, [failed_record(pair, reason) if reason else matcher.match(pair)]
+        for number, record in matcher.match_blocks(blocks, begin, alone=_blocks_alone(len(blocks))):
+            yield number, [record]
 
     def facts(self) -> dict[str, Any]:
         return {"name": "local"}
+
+
+def _blocks_alone(count: int) -> int:
+    """Blocks whose pairs are matched one by one, so that what ends the process is known to be one of them.
+
+    What ended a process while it matched several pairs is in the first two blocks that are not done. When that happens
+    again, it is no single pair: they are too many at once.
+    """
+    ends = crashes()
+    return count if sum(not end.pair for end in ends) > 1 else min(_BLOCKS_AT_ONCE, count) if ends else 0

@@ -322,8 +322,7 @@ def match_block(terms: Terms, inputs: Inputs, block: Sequence[Pair]) -> Done:
     os.environ.update(terms.environment)
     use_threads(terms.threads)
     matcher = CollectionMatcher(terms.options, inputs, terms.labels, _point_matcher(terms.options))
-    with matcher.block(block):
-        records = [matcher.match(pair) for pair in block]
+    records = [record for _, record in matcher.match_blocks([(0, block)], lambda _: None)]
     return Done(records=records, node=f"{socket.gethostname()} ({ray.get_runtime_context().get_node_id()[:8]})")
 
 

@@ -114,6 +114,11 @@ class SparseMatcher:
         """Whether what a pair gives does not depend on what was matched before it."""
         return self.features.repeatable
 
+    @property
+    def concurrent(self) -> bool:
+        """Whether threads may match at once."""
+        return self.features.repeatable
+
     def reset(self) -> None:
         """Forget all features."""
         self.features.clear()

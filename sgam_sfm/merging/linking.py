@@ -9,9 +9,10 @@ import numpy as np
 
 from sgam_sfm.merging.compiled import compiled
 from sgam_sfm.merging.raw import ROWS_A_PART, VARIANCE, PairRows, RawMatches, batches_of, weights_of
-from sgam_sfm.merging.scratch import Scratch, in_order
+from sgam_sfm.merging.scratch import Scratch
 from sgam_sfm.merging.sorting import stable_order
 from sgam_sfm.merging.tracks import Tracks
+from sgam_sfm.threads import in_order
 
 _STEPS = 16  # of strength in an octave: a stronger match joins first, those alike in the order of their pairs
 _MIDDLE = 2**13  # the level of strength 1; that of any number of single precision is within it

@@ -42,10 +42,11 @@ from sgam_sfm.merging.compiled import compiled
 from sgam_sfm.merging.keypoints import CollectionKeypoints, KeypointOptions
 from sgam_sfm.merging.linking import side_by_side, strongest_first
 from sgam_sfm.merging.raw import SCORE, PairRows, RawMatches, RawPair, batches_of, collect, weights_of
-from sgam_sfm.merging.scratch import Rows, Scratch, in_order
+from sgam_sfm.merging.scratch import Rows, Scratch
 from sgam_sfm.merging.settling import Photos, agreeing, align, linked, measure_again
 from sgam_sfm.merging.tracks import Tracks
 from sgam_sfm.pairs import Pair
+from sgam_sfm.threads import in_order
 
 _log = logging.getLogger(__name__)
 

@@ -11,8 +11,9 @@ import numpy as np
 from sgam_core.errors import InputError, ShapeError
 from sgam_core.types import Matches
 from sgam_sfm.merging.affine import local_affine
-from sgam_sfm.merging.scratch import Rows, Scratch, batches, in_order
+from sgam_sfm.merging.scratch import Rows, Scratch, batches
 from sgam_sfm.pairs import Pair
+from sgam_sfm.threads import in_order
 
 _AT_ONCE = 2**15  # matches in one go
 _MIN_WEIGHT = 1e-3  # a match of score 0 still has a place

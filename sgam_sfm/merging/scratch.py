@@ -1,12 +1,10 @@
-"""Arrays that are too long for memory: rows in files, rows sorted by a small number, and work on them by threads."""
+"""Arrays that are too long for memory: rows in files, and rows sorted by a small number."""
 
 from __future__ import annotations
 
-import os
 import shutil
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import Lock
 from typing import TypeVar
@@ -19,7 +17,6 @@ _BUFFERED = 2**25  # bytes that wait in memory before they are written
 _ROWS_AT_ONCE = 2**19
 
 Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 class Scratch:
@@ -137,23 +134,6 @@ class Sorted:
 
     def _path(self, label: int) -> Path:
         return self._folder / f"{label}.rows"
-
-
-def in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """A function of every item, computed by as many threads as there are cores; a few results wait at any time."""
-    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    waiting: deque[Future[Result]] = deque()
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for item in items:
-                waiting.append(pool.submit(function, item))
-                if len(waiting) > 2 * threads:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()
 
 
 def batches(items: Iterable[Item], size: Callable[[Item], int], limit: int) -> Iterator[list[Item]]:

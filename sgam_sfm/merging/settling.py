@@ -20,8 +20,9 @@ from sgam_sfm.merging.raw import (
     batches_of,
     weights_of,
 )
-from sgam_sfm.merging.scratch import Scratch, in_order
+from sgam_sfm.merging.scratch import Scratch
 from sgam_sfm.merging.tracks import Tracks
+from sgam_sfm.threads import in_order
 
 _PATCHES_AT_ONCE = 2**13
 _LARGEST_MOVE = 2.0  # matcher pixels: what moves further has slid along an edge

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -18,17 +17,19 @@ from sgam_sfm.images import read_image, read_mask
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.label_maps import LabelMaps
 from sgam_sfm.logs import in_one_line
-from sgam_sfm.machine import out_of_memory
+from sgam_sfm.machine import out_of_memory, single_threads
 from sgam_sfm.models import require_licence
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
 from sgam_sfm.read_ahead import ReadAhead
 from sgam_sfm.runs.store import PairRecord
-from sgam_sfm.runs.supervised import crashes
+from sgam_sfm.runs.supervised import crashes, given_up
+from sgam_sfm.threads import in_order
 
 _log = logging.getLogger(__name__)
 _DESCRIPTIONS_IN_MEMORY = 1024  # about 1 MB each
 _MOST_FAULTS = 3  # that nobody foresaw, before there is any result
+_MOST_AT_ONCE = 16  # pairs, each with crops in memory; more would wait for the interpreter
 
 
 def create_matcher(options: MatchOptions) -> PointMatcher:
@@ -65,6 +66,11 @@ def is_repeatable(matcher: PointMatcher) -> bool:
     return getattr(matcher, "repeatable", False)
 
 
+def is_concurrent(matcher: PointMatcher) -> bool:
+    """Whether a point matcher says that threads may ask it at once, and get what they would get one after the other."""
+    return getattr(matcher, "concurrent", False)
+
+
 def create_area_matcher(options: MatchOptions, ignored: Collection[int] = ()) -> AreaMatcher:
     """The area matcher that the options name; ignored: more labels that form no areas."""
     matcher: AreaMatcher = registry.create("area-matcher", options.area_matcher, options=options.sgam_ignoring(ignored))
@@ -91,6 +97,8 @@ def failed_record(pair: Pair, reason: str) -> PairRecord:
 class CollectionMatcher:
     """Matches pairs of one collection by name; images are read and described once while they stay in memory.
 
+    Threads may match at once where the point matcher is concurrent.
+
     Raises: OptionError when the options ignore or mask a label that is none.
     """
 
@@ -104,19 +112,51 @@ class CollectionMatcher:
         self._description = lru_cache(_DESCRIPTIONS_IN_MEMORY)(self._describe)
         self._faults, self._any_result = 0, False
 
-    @contextmanager
-    def block(self, pairs: Sequence[Pair]) -> Iterator[None]:
-        """What surrounds the matching of a block's pairs, in their order: caches of the point matcher start empty, but
-        for those that change no result.
+    def match_blocks(
+        self, blocks: Sequence[tuple[int, Sequence[Pair]]], begin: Callable[[Pair], None], *, alone: int = 0
+    ) -> Iterator[tuple[int, PairRecord]]:
+        """The number of the block and the record of every pair, in their order.
+
+        Where the point matcher is concurrent, a pair has one thread, and several are matched at once: that is faster
+        than many threads for one, and results do not depend on how many there are.
+
+        Args: begin: told of each pair that is matched alone. alone: so many blocks whose pairs are, in any case.
+        """
+        if not is_concurrent(self._point_matcher):
+            yield from self._match_alone(blocks, begin)
+            return
+        with single_threads() as threads:
+            at_once = min(threads, _MOST_AT_ONCE)
+            alone = alone if at_once > 1 else len(blocks)
+            yield from self._match_alone(blocks[:alone], begin)
+            pairs = self._in_blocks(blocks[alone:])
+            yield from in_order(lambda item: (item[0], self._unless_given_up(item[1])), pairs, at_once)
+
+    def _match_alone(
+        self, blocks: Sequence[tuple[int, Sequence[Pair]]], begin: Callable[[Pair], None]
+    ) -> Iterator[tuple[int, PairRecord]]:
+        for number, pair in self._in_blocks(blocks):
+            begin(pair)
+            yield number, self._unless_given_up(pair)
+
+    def _in_blocks(self, blocks: Sequence[tuple[int, Sequence[Pair]]]) -> Iterator[tuple[int, Pair]]:
+        """What surrounds the matching of each block's pairs: caches of the point matcher start empty, but for those
+        that change no result.
 
         Images of the pairs that follow are read while one is matched; not once a process of this run has been ended
         from outside, so that what a pair is told to have done was done for this pair.
         """
-        if not is_repeatable(self._point_matcher):
-            reset(self._point_matcher)
-        names = () if crashes() else [name for pair in pairs for name in pair]
-        with self.image.ahead(names):
-            yield
+        for number, pairs in blocks:
+            if not is_repeatable(self._point_matcher):
+                reset(self._point_matcher)
+            names = () if crashes() else [name for pair in pairs for name in pair]
+            with self.image.ahead(names):
+                for pair in pairs:
+                    yield number, pair
+
+    def _unless_given_up(self, pair: Pair) -> PairRecord:
+        reason = given_up(pair)
+        return failed_record(pair, reason) if reason else self.match(pair)
 
     def match(self, pair: Pair) -> PairRecord:
         """The record of one pair; whatever stops it becomes part of it, such as a fault in somebody's point matcher.

@@ -13,8 +13,11 @@ from sgam_core.errors import WeightsError
 from sgam_core.types import Box, Crop, Matches
 from sgam_sfm import models
 from sgam_sfm.external import WorkerCommand
+from sgam_sfm.machine import single_threads
 from sgam_sfm.matchers.vismatch import VARIABLE, environment, how_to_make, python_of
 from sgam_sfm.registry import available, create
+from sgam_sfm.runs.matching import is_concurrent
+from sgam_sfm.threads import in_order
 from tests.paths import weights_of
 from tests.textures import similarity, transfer, view, whole
 
@@ -201,6 +204,20 @@ def test_a_list_is_matched_as_its_pairs_are_and_in_their_order(matcher, pair):
     assert len({len(matches) for matches in together}) == len(pairs)  # so that a wrong order would show
     for crops, matches in zip(pairs, together, strict=True):
         assert_equal(matches, matcher.match([crops])[0])
+
+
+def test_threads_get_what_one_thread_gets(matcher, pair):
+    if not is_concurrent(matcher):
+        pytest.skip("is asked by one thread at a time")
+    part = Crop(image=pair[0].image, window=Box(x0=60, y0=40, x1=260, y1=200), size=(200, 160))
+    pairs = [(pair[0], pair[1]), (part, pair[1]), (pair[1], pair[0]), (pair[0], part)]
+    with single_threads():
+        matcher.reset()
+        expected = [matcher.match([crops])[0] for crops in pairs]
+        matcher.reset()
+        found = list(in_order(lambda crops: matcher.match([crops])[0], pairs, threads=4))
+    for one, other in zip(found, expected, strict=True):
+        assert_equal(one, other)
 
 
 def test_swapping_the_images_finds_the_same_warp(matcher, pair):

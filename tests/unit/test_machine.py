@@ -1,10 +1,12 @@
 """What a run uses of the machine."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import torch
 
 from sgam_core.errors import OptionError
-from sgam_sfm.machine import multiplies_bfloat16, runs_half, use_threads
+from sgam_sfm.machine import multiplies_bfloat16, runs_half, single_threads, use_threads
 
 
 def test_all_threads_are_used_again_after_a_run_with_one():
@@ -13,6 +15,14 @@ def test_all_threads_are_used_again_after_a_run_with_one():
     use_threads(1)
     assert torch.get_num_threads() == 1
     use_threads(0)
+    assert torch.get_num_threads() == before
+
+
+def test_every_thread_of_ours_has_one_thread_of_torch():
+    before = torch.get_num_threads()
+    with single_threads() as threads, ThreadPoolExecutor(1) as pool:
+        assert threads == before
+        assert pool.submit(torch.get_num_threads).result() == 1
     assert torch.get_num_threads() == before
 
 

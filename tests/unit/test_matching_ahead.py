@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import combinations, count
 from pathlib import Path
+from threading import Barrier
 
 import numpy as np
 import PIL.Image
@@ -17,6 +18,7 @@ from sgam_sfm.executors import MatchingJob
 from sgam_sfm.executors.local import LocalExecutor
 from sgam_sfm.images import read_image
 from sgam_sfm.inputs import Inputs, read_inputs
+from sgam_sfm.machine import use_threads
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import blocks
 from sgam_sfm.progress import Stages
@@ -32,6 +34,7 @@ class MeanMatcher:
 
     calls: list[tuple[str, str]] = field(default_factory=list)
     repeatable: bool = False
+    concurrent: bool = False
     resets: int = 0
 
     def reset(self) -> None:
@@ -58,12 +61,26 @@ def inputs(options) -> Inputs:
     return read_inputs(options, Stages(quiet=True))
 
 
-def matched(options: MatchOptions, inputs: Inputs) -> dict[tuple[str, str], tuple[list, str]]:
+@pytest.fixture
+def four_threads() -> Iterator[None]:
+    use_threads(4)
+    yield
+    use_threads(0)
+
+
+def matched(
+    options: MatchOptions,
+    inputs: Inputs,
+    matcher: MeanMatcher | None = None,
+    begin: Callable[[tuple[str, str]], None] = lambda _: None,
+) -> dict[tuple[str, str], tuple[list, str]]:
     """What each pair's record holds."""
-    executor = LocalExecutor(device="cpu", point_matcher=MeanMatcher())
+    executor = LocalExecutor(device="cpu", point_matcher=matcher or MeanMatcher())
     job = MatchingJob(options=options, inputs=inputs, labels=None)
     numbered = list(enumerate(blocks(inputs.pairs.pairs, options.block_images)))
-    records = [r for _, records in executor.run(job, numbered, lambda _: None) for r in records]
+    found = [(number, record) for number, records in executor.run(job, numbered, begin) for record in records]
+    assert [(number, record.pair) for number, record in found] == [(n, pair) for n, block in numbered for pair in block]
+    records = [record for _, record in found]
     assert {record.pair for record in records} == set(combinations(sorted(inputs.images), 2))
     return {record.pair: (content(record), record.error) for record in records}
 
@@ -78,6 +95,47 @@ def test_results_do_not_depend_on_reading_ahead(options, inputs, monkeypatch):
     monkeypatch.setattr(read_ahead, "_AHEAD", 0)
     assert matched(options, inputs) == ahead
     assert len({repr(points) for points, _ in ahead.values()}) == NUM_IMAGES * (NUM_IMAGES - 1) // 2
+
+
+def test_results_do_not_depend_on_how_many_pairs_are_matched_at_once(options, inputs, four_threads):
+    told: list[tuple[str, str]] = []
+    together, number = Barrier(4, timeout=10), count()
+
+    class Together(MeanMatcher):
+        def match(self, pairs):
+            if next(number) < 4:
+                together.wait()  # passes when four threads are here
+            return super().match(pairs)
+
+    one = matched(options, inputs)
+    assert matched(options, inputs, Together(repeatable=True, concurrent=True), told.append) == one
+    assert told == []  # none of them would be known to have ended this process
+
+
+@pytest.mark.parametrize(
+    ("ends", "alone"),
+    [
+        ([], 0),
+        ([()], 2),
+        ([(), ("0.png", "4.png")], 2),
+        ([(), ()], 10),
+        ([("0.png", "1.png"), ("0.png", "1.png")], 2),
+    ],
+)
+def test_pairs_are_matched_one_by_one_where_one_of_them_ended_the_process(
+    options, inputs, monkeypatch, four_threads, ends, alone
+):
+    expected = matched(options, inputs)
+    crashes = tuple(supervised.Crash(signal="SIGKILL", pair=pair) for pair in ends)
+    monkeypatch.setattr(supervised._state, "crashes", crashes)
+    told: list[tuple[str, str]] = []
+    found = matched(options, inputs, MeanMatcher(repeatable=True, concurrent=True), told.append)
+    order = blocks(inputs.pairs.pairs, options.block_images)
+    assert told == [pair for block in order[:alone] for pair in block]
+    given_up = {pair for pair in ends if pair and ends.count(pair) == 2}
+    assert {pair for pair in found if found[pair] != expected[pair]} == given_up
+    for pair in given_up:
+        assert "was ended by SIGKILL (out of memory?) while it matched this pair, 2 times" in found[pair][1]
 
 
 def test_an_image_that_is_gone_or_broken_is_the_reason_of_its_pairs_alone(options, inputs, monkeypatch):

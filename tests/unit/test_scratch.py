@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sgam_sfm.merging import scratch
-from sgam_sfm.merging.scratch import Scratch, batches, in_order
+from sgam_sfm.merging.scratch import Scratch, batches
 
 
 def test_rows_are_read_as_they_were_written_and_the_folder_goes_even_after_an_error(tmp_path):
@@ -45,12 +45,6 @@ def test_rows_of_one_label(tmp_path):
         rows.put(np.array([3, 1, 3]), np.array([[5], [6], [7]]))
         assert rows.finish() == [1, 3]
         np.testing.assert_array_equal(rows.take_label(3), [[5], [7]])
-
-
-def test_work_comes_back_in_order_and_an_error_is_not_lost():
-    assert list(in_order(lambda number: number**2, range(50))) == [number**2 for number in range(50)]
-    with pytest.raises(ZeroDivisionError):
-        list(in_order(lambda number: 1 // (3 - number), range(50)))
 
 
 def test_batches_hold_what_fits_and_one_item_at_least():
