@@ -48,14 +48,14 @@ class Vote:
     count: int
 
 
-def find_landmarks(pixels: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None) -> Landmarks:
+def find_landmarks(gray: UInt8[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"] | None) -> Landmarks:
     """The landmarks of an image, inside its mask."""
-    scale = min(_LONG_SIDE / max(pixels.shape[:2]), 1.0)
-    size = tuple(max(round(scale * side), 1) for side in pixels.shape[1::-1])
-    gray = cv2.cvtColor(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    scale = min(_LONG_SIDE / max(gray.shape), 1.0)
+    size = tuple(max(round(scale * side), 1) for side in gray.shape[::-1])
+    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     if mask is not None:
         mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT).astype(bool)
-    keypoints, descriptors = strongest_sift(gray, mask, _MOST)
+    keypoints, descriptors = strongest_sift(small, mask, _MOST)
     return Landmarks(
         descriptors=descriptors,
         angles=np.array([keypoint.angle for keypoint in keypoints], np.float32),

@@ -102,9 +102,15 @@ class Image:
         return int(self.pixels.shape[0])
 
     @cached_property
+    def gray(self) -> UInt8[np.ndarray, "H W"]:
+        """Its luminance, found when first asked for."""
+        gray: np.ndarray = cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY)
+        return gray
+
+    @cached_property
     def landmarks(self) -> Landmarks:
         """What tells how it lies and is sized against another image; found when first asked for."""
-        return find_landmarks(self.pixels, self.mask)
+        return find_landmarks(self.gray, self.mask)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -114,7 +120,7 @@ class Crop:
     window: whole pixels inside the image. size: (width, height) in the matcher's pixels, as it sees them. turns:
     quarter turns anticlockwise, 0 to 3. alike: things have one size in both crops of the pair, as far as an earlier
     round tells, so that a matcher which looks at several sizes may do with one. The resize is isotropic up to the
-    rounding of `size`; `crop_from_image` is the exact affine map of what `pixels` returns.
+    rounding of `size`; `crop_from_image` is the exact affine map of what `pixels` and `gray` return.
     """
 
     image: Image
@@ -170,7 +176,11 @@ class Crop:
 
     def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
         """The crop's own pixels (h, w, 3) RGB."""
-        return self._turn(_resize(self._cut(self.image.pixels), self._size_before_turns, smooth=True))
+        return self._seen(self.image.pixels)
+
+    def gray(self) -> UInt8[np.ndarray, "h w"]:
+        """Its own luminance (h, w), for matchers that want no colours: they are cropped three times as fast."""
+        return self._seen(self.image.gray)
 
     def mask(self) -> Bool[np.ndarray, "h w"] | None:
         """The crop's mask (h, w), True where matches are wanted; None when the image has none."""
@@ -182,6 +192,10 @@ class Crop:
     @property
     def _size_before_turns(self) -> tuple[int, int]:
         return self.size[::-1] if self.turns % 2 else self.size
+
+    def _seen(self, array: np.ndarray) -> np.ndarray:
+        """What the crop shows of an array of the image's size."""
+        return self._turn(_resize(self._cut(array), self._size_before_turns, smooth=True))
 
     def _turn(self, array: np.ndarray) -> np.ndarray:
         return np.rot90(array, self.turns).copy() if self.turns else array
@@ -230,13 +244,13 @@ class WarpedCrop(Crop):
         image_points: np.ndarray = points @ self._affine[:, :2].T + self._affine[:, 2]
         return image_points
 
-    def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
-        return self._warp(self._resized.pixels(), cv2.INTER_LINEAR, cv2.BORDER_REFLECT_101)
-
     def mask(self) -> Bool[np.ndarray, "h w"]:
         mask = self._resized.mask()
         shown = np.ones(self._resized.size[::-1], np.uint8) if mask is None else mask.astype(np.uint8)
         return self._warp(shown, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT).astype(bool)
+
+    def _seen(self, array: np.ndarray) -> np.ndarray:
+        return self._warp(self._resized._seen(array), cv2.INTER_LINEAR, cv2.BORDER_REFLECT_101)
 
     @property
     def _resized(self) -> Crop:

@@ -102,7 +102,7 @@ class _View:
 
 
 def _view(crop: Crop) -> _View:
-    gray = cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    gray = crop.gray().astype(np.float32)
     factor = min(WIDTH / crop.size[0], HEIGHT / crop.size[1])
     width, height = (max(1, round(factor * side)) for side in crop.size)
     small = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR)

@@ -103,8 +103,7 @@ class EfficientLoFTR:
 
     def _frames(self, crops: Sequence[Crop]) -> Float[Tensor, "B 1 h w"]:
         """Crops as the network sees them: grey, in [0, 1], resized to `frame_size`."""
-        grey = (cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY) for crop in crops)
-        resized = [cv2.resize(pixels, frame_size(crop)) for pixels, crop in zip(grey, crops, strict=True)]
+        resized = [cv2.resize(crop.gray(), frame_size(crop)) for crop in crops]
         return torch.from_numpy(np.stack(resized)[:, None]).to(self.device).float() / 255
 
     def _features(

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from kornia.feature import LoFTR as Network
@@ -140,7 +139,7 @@ def _frames(crops: Sequence[Crop]) -> np.ndarray:
     width, height = _padded(crops[0])
     frames = np.zeros((len(crops), 1, height, width), np.float32)
     for frame, crop in zip(frames, crops, strict=True):
-        frame[0, : crop.size[1], : crop.size[0]] = cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY) / np.float32(255)
+        frame[0, : crop.size[1], : crop.size[0]] = crop.gray() / np.float32(255)
     return frames
 
 

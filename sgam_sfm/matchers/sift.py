@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 import torch
 
@@ -33,10 +32,9 @@ class SIFTExtractor:
         return [self._extract(crop) for crop in crops]
 
     def _extract(self, crop: Crop) -> Features:
-        gray = cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY)
         # With its precise upscaling, OpenCV has the first pixel centred on 0 in every octave.
         found, descriptors = strongest_sift(
-            gray, crop.mask(), self._count, contrastThreshold=CONTRAST, enable_precise_upscale=True
+            crop.gray(), crop.mask(), self._count, contrastThreshold=CONTRAST, enable_precise_upscale=True
         )
         if not found:
             return Features.none(crop, CHANNELS, self._device)

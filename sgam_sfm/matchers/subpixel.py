@@ -109,9 +109,9 @@ def aligned(
 
     The scores fall by the share of the patches that does not correlate.
 
-    Args: grays: the intensities of both crops, for a caller that has kept them: see `intensities`.
+    Args: grays: of both crops, for a caller that has kept them.
     """
-    grays = grays or (intensities(crop0.pixels()), intensities(crop1.pixels()))
+    grays = grays or (crop0.gray(), crop1.gray())
     gray0, gray1 = (gray.astype(np.float32) for gray in grays)
     affines = local_affines(matches.points0, matches.points1)
     points1, correlations = refine(gray0, gray1, matches.points0, matches.points1, affines, strides=(1,))
@@ -122,12 +122,6 @@ def aligned(
         points1=np.where(better[:, None], points1, matches.points1),
         scores=matches.scores * (1 + correlations) / 2,
     )
-
-
-def intensities(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
-    """What patches are compared by."""
-    gray: np.ndarray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-    return gray
 
 
 def _smoothed(gray: np.ndarray, stride: int) -> np.ndarray:

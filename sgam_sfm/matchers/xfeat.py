@@ -33,7 +33,7 @@ from sgam_sfm.matchers.feature_cache import FeatureCache
 from sgam_sfm.matchers.masks import wanted
 from sgam_sfm.matchers.sparse import batch_size as together
 from sgam_sfm.matchers.state_dicts import fill, read_tensors
-from sgam_sfm.matchers.subpixel import aligned, intensities
+from sgam_sfm.matchers.subpixel import aligned
 from sgam_sfm.weights import XFEAT, find_weights
 
 CELL = 8  # pixels of the network's input per cell
@@ -183,22 +183,22 @@ class XFeatStar:
     def _extract(self, crops: Sequence[Crop]) -> list[_Features]:
         """The features of crops of one size, all alike or none, which go through the network together."""
         width, height = crops[0].size
-        pixels = [crop.pixels() for crop in crops]
-        gray = torch.stack([torch.from_numpy(each).to(self.device).float().mean(-1) for each in pixels])
+        grays = [crop.gray() for crop in crops]
+        frames = torch.stack([torch.from_numpy(gray).to(self.device) for gray in grays])[:, None].float()
         budget = max(MIN_FEATURES, round(self.features_per_megapixel * width * height / 1e6))
         shares = ((self.alike_scale, 1.0),) if crops[0].alike else self.shares
-        scales = [self._extract_at(scale, round(share * budget), gray, crops) for scale, share in shares if share]
+        scales = [self._extract_at(scale, round(share * budget), frames, crops) for scale, share in shares if share]
         found = []
-        for own, parts in zip(pixels, zip(*scales, strict=True), strict=True):
+        for gray, parts in zip(grays, zip(*scales, strict=True), strict=True):
             descriptors, centers, steps = (torch.cat(of_scales) for of_scales in zip(*parts, strict=True))
-            found.append(_Features(descriptors, centers, steps, intensities(own)))
+            found.append(_Features(descriptors, centers, steps, gray))
         return found
 
-    def _extract_at(self, scale: float, count: int, gray: Tensor, crops: Sequence[Crop]) -> list[_Cells]:
+    def _extract_at(self, scale: float, count: int, frames: Tensor, crops: Sequence[Crop]) -> list[_Cells]:
         """The `count` most reliable cells of each crop, seen at `scale` of its size."""
         size = crops[0].size
         width, height = (max(MULTIPLE, round(scale * side / MULTIPLE) * MULTIPLE) for side in size)
-        images = interpolate(gray[:, None], (height, width), mode="bilinear", align_corners=False)
+        images = interpolate(frames, (height, width), mode="bilinear", align_corners=False)
         with torch.autocast(self.device.type, torch.float16, enabled=self._half):
             maps, _, reliability = self._net(images.contiguous(memory_format=torch.channels_last))
 
