@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import get_native_id
 from typing import Any
 
 from pydantic_core import to_jsonable_python
@@ -24,7 +25,7 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
     Args: durable: wait until the content is on the disk, so that not even a power cut leaves the name with half of it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.with_name(f".{path.name}.{get_native_id()}.partial")  # threads may write the same
     try:
         yield partial
         if durable:

@@ -33,7 +33,7 @@ from sgam_sfm.progress import Stages
 from sgam_sfm.runs.matching import CollectionMatcher, create_area_matcher
 from sgam_sfm.runs.summary import versions
 
-VERSION = 1
+VERSION = 2
 _AMP_OVERLAP = 0.7
 
 _PAPER = {"guidance__enabled": False}
@@ -145,7 +145,7 @@ def figures_of(pairs: Sequence[JudgedPair], auc_degrees: Sequence[float], *, by_
     for index, pixels in enumerate(PIXELS):
         figures[f"mma_{pixels}"] = 100 * fmean(pair.precision[index] for pair in pairs)
         figures[f"mma_{pixels}_at_640"] = 100 * fmean(pair.precision_640[index] for pair in pairs)
-    areas = pose_auc([pair.pose_error_deg for pair in pairs], auc_degrees)
+    areas = pose_auc([error for pair in pairs for error in pair.pose_errors_deg], auc_degrees)
     figures |= {f"auc_{degrees:g}": 100 * area for degrees, area in zip(auc_degrees, areas, strict=True)}
     for name, chosen in (
         ("soa", areas_of(pairs, kind="object", stage="putative")),
@@ -260,7 +260,7 @@ def _judge(
         seconds = {**record.result.seconds, "point matching": matcher.charged}
         rng = np.random.default_rng([options.seed, number])
         result = replace(record.result, seconds=seconds)
-        judged[pair] = judge_pair(truth, _views(truth, names, pair), result, whole[pair], rng, 500)
+        judged[pair] = judge_pair(truth, _views(truth, names, pair), result, whole[pair], rng)
     return judged
 
 

@@ -20,6 +20,7 @@ from sgam_sfm.files import replacing
 from sgam_sfm.images import ImageFile, read_image
 from sgam_sfm.segmenters.clustering import Projection, principal_components, stable_clusters
 from sgam_sfm.segmenters.dino import PatchFeatures
+from sgam_sfm.threads import in_order, num_cores
 from sgam_sfm.weights import DINOV2_FOCUS, find_weights
 
 logger = logging.getLogger(__name__)
@@ -34,6 +35,7 @@ _TOLERANCE = 0.05  # of agreement between runs: about its own noise; within it m
 _MAX_SAMPLES = 20_000  # patches that k-means sees
 _LABEL_MAP_WIDTH = 640  # pixels, as the layout constants of the method
 _FEATURE_SHARE = 0.9  # of an image's work
+_MOST_AT_ONCE = 8  # images, each with a photo and up to 150 MB of the network's in memory
 
 
 class CoSeg:
@@ -75,12 +77,15 @@ class CoSeg:
         if name:
             from sgam_sfm.segmenters.dino_hub import HubPatchFeatures
 
+            self._at_once = 1  # torch takes all cores, or the GPU, for one
             self._patch_features = large = HubPatchFeatures(name, image_size=image_size, device=device)
             settings = (large.digest, image_size, device)
         else:
             path = find_weights(DINOV2_FOCUS, weights)
+            threads = threads or num_cores()
+            self._at_once = min(threads, _MOST_AT_ONCE)
             self._patch_features = PatchFeatures(
-                path, block=_BLOCK, image_size=image_size, device=device, threads=threads
+                path, block=_BLOCK, image_size=image_size, device=device, threads=threads // self._at_once
             )
             with path.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -97,21 +102,28 @@ class CoSeg:
     ) -> Iterator[tuple[ImageFile, Int32[np.ndarray, "H W"] | Exception]]:
         # Two passes over the features, which need not fit into memory: without a cache they wait on the disk too.
         with self._cache() as cache:
+
+            def sample_of(image: ImageFile) -> np.ndarray:
+                return self._draw(image, self._features(image, cache), _MAX_SAMPLES // len(images))
+
             errors: dict[str, SGAMError] = {}
             samples: list[np.ndarray] = []
-            for image in sorted(images, key=lambda image: image.digest):
-                try:
-                    samples.append(self._draw(image, self._features(image, cache), _MAX_SAMPLES // len(images)))
-                except SGAMError as error:
-                    errors[image.name] = error
+            for image, drawn in self._of_each(sample_of, sorted(images, key=lambda image: image.digest)):
+                if isinstance(drawn, SGAMError):
+                    errors[image.name] = drawn
+                else:
+                    samples.append(drawn)
                 advance(_FEATURE_SHARE)
             if samples:
                 project, centers = self._cluster(np.concatenate(samples))
-            for image in images:
+
+            def labels_of(image: ImageFile) -> np.ndarray:
                 if image.name in errors:
-                    yield image, errors[image.name]
-                else:
-                    yield image, _label_map(project(self._features(image, cache)), centers, image)
+                    raise errors[image.name]
+                return _label_map(project(self._features(image, cache)), centers, image)
+
+            for image, labels in self._of_each(labels_of, images):
+                yield image, labels
                 advance(1 - _FEATURE_SHARE)
 
     def describe(
@@ -122,12 +134,24 @@ class CoSeg:
         On the images of docs/pairs.md it found at least as many overlapping pairs as the network's class token there.
         """
         with self._cache() as cache:
-            for image in images:
-                try:
-                    yield image, self._patches(image, cache).mean(axis=(0, 1), dtype=np.float32)
-                except SGAMError as error:
-                    yield image, error
+            for image, mean in self._of_each(
+                lambda image: self._patches(image, cache).mean(axis=(0, 1), dtype=np.float32), images
+            ):
+                yield image, mean
                 advance(1)
+
+    def _of_each(
+        self, function: Callable[[ImageFile], np.ndarray], images: Sequence[ImageFile]
+    ) -> Iterator[tuple[ImageFile, np.ndarray | SGAMError]]:
+        """A function of every image, or why there is none; of several at once."""
+
+        def tried(image: ImageFile) -> tuple[ImageFile, np.ndarray | SGAMError]:
+            try:
+                return image, function(image)
+            except SGAMError as error:
+                return image, error
+
+        return in_order(tried, images, self._at_once)
 
     @contextmanager
     def _cache(self) -> Iterator[Path]:

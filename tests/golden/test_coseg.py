@@ -56,6 +56,15 @@ def test_order_and_names_do_not_matter(quick, drawn, tmp_path):
         np.testing.assert_array_equal(labels[new], expected[old])
 
 
+def test_the_number_of_threads_and_equal_images_do_not_matter(drawn, tmp_path):
+    for number in range(6):
+        shutil.copy(drawn / f"{number % 3}.png", tmp_path / f"{number}.png")
+    images = inspect_all(tmp_path)
+    alone, together = (run(CoSeg(image_size=224, threads=threads), images) for threads in (1, 4))
+    for name, labels in alone.items():
+        np.testing.assert_array_equal(together[name], labels)
+
+
 def test_a_cache_changes_nothing_and_is_used(quick, drawn, tmp_path, monkeypatch):
     expected = run(quick, inspect_all(drawn))
     monkeypatch.setattr(quick, "_cache_folder", tmp_path / "cache")

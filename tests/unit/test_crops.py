@@ -206,3 +206,14 @@ def test_a_crop_that_is_turned_aslant_looks_so():
     shown = crop.turned(45).contains(np.array([(centre, centre), (2, 2), (-1, centre)], float))
     assert shown.tolist() == [True, False, False]  # the corners show nothing
     assert abs(float(pixels[centre - 15, centre - 15]) - 128) < 90  # on the line between
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 30])
+@pytest.mark.parametrize("long_side", [40, 200, 420])
+def test_the_gray_of_a_crop_is_that_of_its_pixels(long_side, degrees):
+    shown = Image(name="a", pixels=view(np.eye(3), (240, 180)))
+    crop = box_crop(shown, Box(x0=20, y0=30, x1=220, y1=140), long_side, upsample=True).turned(degrees)
+    expected = cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY)
+    assert crop.gray().dtype == np.uint8
+    # Each is rounded twice or three times.
+    np.testing.assert_allclose(crop.gray().astype(int), expected, atol=3)
