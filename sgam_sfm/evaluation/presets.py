@@ -1,4 +1,4 @@
-"""How the paper evaluates each data set: sizes, thresholds, angles; and pairs by frame difference."""
+"""How the paper evaluates each data set: sizes and angles; and pairs by frame difference."""
 
 from __future__ import annotations
 
@@ -14,49 +14,24 @@ from sgam_sfm.pairs import Pair
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DatasetPreset:
-    """One data set of the paper.
+    """How a data set is evaluated.
 
     format: of its ground truth, a key of FORMATS. area_size: side in pixels that areas are matched at (paper, appendix,
-    Implementation Details). error_width: image width in pixels that match errors are reported at. mma_thresholds: in
-    those pixels. auc_angles: degrees. max_matches: drawn for MMA and poses (MCN). amp_threshold: of AOR.
-    frame_differences: of the pairs it samples from video, empty where a list is published or the sampling is unknown.
-    num_pairs: of each. tables: of the paper, by what they show. in_paper: False where we follow others.
+    Implementation Details). auc_angles: degrees.
     """
 
     format: str
     area_size: int
     auc_angles: tuple[float, ...] = (5, 10, 20)
-    error_width: int = 640
-    mma_thresholds: tuple[float, ...] = (1, 2, 3)
-    max_matches: int = 500
-    amp_threshold: float = 0.7
-    frame_differences: tuple[int, ...] = ()
-    num_pairs: int | None = None
-    tables: tuple[str, ...] = ()
-    in_paper: bool = True
 
 
 PRESETS: Mapping[str, DatasetPreset] = {
-    "scannet": DatasetPreset(
-        format="scannet",
-        area_size=256,
-        frame_differences=(5, 10, 30),
-        num_pairs=1500,
-        tables=("MMA", "pose AUC, ScanNet", "AOR and AMP"),
-    ),
-    "scannet1500": DatasetPreset(
-        format="scannet1500", area_size=640, num_pairs=1500, tables=("pose AUC, ScanNet1500",)
-    ),
-    "matterport3d": DatasetPreset(
-        format="matterport3d",
-        area_size=480,
-        auc_angles=(10, 20, 30),
-        num_pairs=500,
-        tables=("MMA", "pose AUC, MatterPort3D"),
-    ),
-    "kitti360": DatasetPreset(format="kitti360", area_size=480, tables=("pose AUC, KITTI-360",)),
-    "yfcc100m": DatasetPreset(format="yfcc100m", area_size=480, num_pairs=4000, tables=("pose AUC, YFCC100M",)),
-    "megadepth1500": DatasetPreset(format="megadepth1500", area_size=640, num_pairs=1500, in_paper=False),
+    "scannet": DatasetPreset(format="scannet", area_size=256),
+    "scannet1500": DatasetPreset(format="scannet1500", area_size=640),
+    "matterport3d": DatasetPreset(format="matterport3d", area_size=480, auc_angles=(10, 20, 30)),
+    "kitti360": DatasetPreset(format="kitti360", area_size=480),
+    "yfcc100m": DatasetPreset(format="yfcc100m", area_size=480),
+    "megadepth1500": DatasetPreset(format="megadepth1500", area_size=640),  # not in the paper
 }
 """Presets by the name that `--dataset` takes."""
 

@@ -66,8 +66,8 @@ class JudgedPair:
 
     precision, precision_640: share of the matches within `PIXELS`, at the image's own pixels and at 640 wide.
     by_depth: share of the matches that depth judged. pose_errors_deg: of the pose from each sample of the matches, 180
-    when there is none. fallback: as in `PairResult`. pixels_matched: of every point-matcher call. seconds: by stage. error: why the pair could not be
-    matched; it counts as one without matches and pose.
+    when there is none. fallback: as in `PairResult`. pixels_matched: of every point-matcher call. seconds: by stage.
+    error: why the pair could not be matched; it counts as one without matches and pose.
     """
 
     num_matches: int
