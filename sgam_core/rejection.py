@@ -75,10 +75,10 @@ def _consensus(
     geometry: GeometryOptions,
     options: RejectionOptions,
 ) -> tuple[list[MatchedArea], TwoViewModel | None, str]:
-    """One robust geometry of all areas' matches judges each of them.
+    """One robust geometry of all areas' matches judges each of them, and leaves the kept ones their inliers.
 
-    # Differs from the paper: with phi < 1 its threshold lies below every value it is compared with, since an area's
-    # own geometry already minimises its own distance.
+    # Differs from the paper: there, areas keep their outliers, and with phi < 1 its threshold lies below every value it
+    # is compared with, since an area's own geometry already minimises its own distance.
     """
     pool = _pool(candidates, options.max_pooled)
     if single and len(whole) >= geometry.min_matches:
@@ -103,7 +103,7 @@ def _judge(
         return candidate.resolved(AreaState.REJECTED, f"GR: {count} inliers of {total}, below {options.min_inliers}")
     if total - count > options.max_outlier_share * total:
         return candidate.resolved(AreaState.REJECTED, f"GR: {count} inliers of {total}, the rest contradict the pair")
-    return candidate
+    return replace(candidate, matches=candidate.matches.select(inlier))
 
 
 def _paper(

@@ -7,7 +7,7 @@ import pytest
 
 from sgam_core import collection
 from sgam_core.collection import collect, coverage, merge
-from sgam_core.geometry import estimate_two_view
+from sgam_core.geometry import estimate_two_view, residuals
 from sgam_core.options import CollectionOptions, GeometryOptions, PredictionOptions, RejectionOptions
 from sgam_core.prediction import MatchedArea, predict
 from sgam_core.rejection import reject
@@ -164,6 +164,21 @@ def test_gr_compares_a_single_area_with_the_whole_images():
     whole = two_views(500, noise=0.4, outliers=0.3, seed=2).matches
     assert states(judge([true_area(WINDOWS[0], 1)], whole=whole).areas) == ["kept"]
     assert states(judge([wrong_area(WINDOWS[0], WINDOWS[3], 1)], whole=whole).areas) == ["rejected"]
+
+
+def test_gr_leaves_kept_areas_their_inliers_so_that_outliers_do_not_open_gmc():
+    areas = [true_area(window, k) for k, window in enumerate(WINDOWS)]  # a tenth are outliers
+    verdict = judge(areas)
+    assert verdict.model is not None
+    assert states(verdict.areas) == ["kept"] * 5
+    for before, after in zip(areas, verdict.areas, strict=True):
+        assert 0.85 * len(before.matches) < len(after.matches) < 0.95 * len(before.matches)
+        assert (residuals(verdict.model.F, after.matches) <= GEOMETRY.max_residual).mean() > 0.97
+    whole = Matches.concatenate([area.matches for area in areas])
+    inside = [area.matches for area in verdict.areas]
+    collected = collect(inside, 0.1, verdict.model, lambda: whole, CollectionOptions())
+    assert (residuals(verdict.model.F, collected) <= 1).all()
+    assert len(collected) > 0.75 * len(whole)
 
 
 def test_gr_falls_back_when_the_areas_agree_on_nothing():
