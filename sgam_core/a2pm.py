@@ -201,13 +201,24 @@ def _guided(first: _Found, points: PairPoints, estimate: Estimate, options: SGAM
     verdict = reject(looked, points.whole, True, estimate, options.geometry, options.rejection)
     if verdict.fallback:
         return None
-    if verdict.model is None or (
-        (residuals(verdict.model.F, agreeing) <= options.geometry.max_residual).mean() < options.guidance.min_agreement
-    ):
+    known = agreeing
+    if any(area.area.state is AreaState.REJECTED for area in looked):  # it agreed on both of two places
+        known = _inside(agreeing, [area.area for area in verdict.areas if area.area.state is AreaState.KEPT])
+    if verdict.model is None or not len(known):
+        return None
+    if (residuals(verdict.model.F, known) <= options.geometry.max_residual).mean() < options.guidance.min_agreement:
         return None
     areas = (*first.areas, *verdict.areas)
     matches = _collected(areas, verdict.model, lambda: first.matches, points, options, begin=len(first.areas))
     return _Found(matches=matches, model=verdict.model, areas=areas, notes=first.notes)
+
+
+def _inside(matches: Matches, areas: Sequence[AreaMatch]) -> Matches:
+    """The matches that lie in any of the area matches."""
+    inside = np.zeros(len(matches), bool)
+    for area in areas:
+        inside |= area.area0.box.contains(matches.points0) & area.area1.box.contains(matches.points1)
+    return matches.select(inside)
 
 
 def _collected(

@@ -270,7 +270,8 @@ class GuidanceOptions(_Checked):
     margin: float = 0.1
     """Added on each side of a window or cut area, share of its long side (0: nothing)."""
     min_agreement: float = 0.7
-    """Share of the first round's consistent matches that the second one's geometry must explain."""
+    """Share of the first round's consistent matches that the second one's geometry must explain; of one that put a
+    place in two, those inside the areas that are left."""
     max_bend: float = 0.04
     """A window's crops are warped to look alike where its matches follow one affine map: the largest median distance
     from it, share of the window's long side (0: no crop is warped)."""

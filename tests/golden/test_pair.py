@@ -7,6 +7,7 @@ bounds leave a third of room, and the comparisons are what the project promises.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -80,3 +81,20 @@ def test_warped_crops_find_more_where_the_views_are_far_apart(scene):
     )
     assert (warped < 1).sum() > 1.4 * (upright < 1).sum() > 700
     assert (warped < 0.25).sum() > 2 * (upright < 0.25).sum() > 700
+
+
+@pytest.mark.parametrize("seed", [0, 29])
+def test_a_facade_whose_parts_look_alike_is_seen_in_one_place(data, seed):
+    scene, names = data / "strecha" / "castle-P19", ("0012.jpg", "0015.jpg")
+    K = np.loadtxt(scene / "images" / "K.txt").reshape(3, 3)
+    K[:2, 2] += 0.5
+    images, areas = [replace(image, camera_matrix=K) for image in read(scene, names)], SemanticAreaMatcher()
+    nothing = [areas.describe(image, np.zeros((1, 1), np.int32)) for image in images]
+    options = changed(
+        SGAMOptions(), geometry__seed=seed
+    )  # whole images agree on a mixture of two places, as it happens
+    found = match_described(*images, *nothing, areas, XFeatStar(), options)
+    assert found.fallback == ""
+    assert {AreaState.KEPT, AreaState.REJECTED} == {area.state for area in found.areas}
+    assert (errors_px(scene, names, found) < 4).mean() > 0.8
+    assert len(found.matches) > 1500
