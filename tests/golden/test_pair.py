@@ -1,4 +1,4 @@
-"""Real pairs with known geometry, Herz-Jesus-P8 at 3072x2048: two images 7 degrees apart, and two 42 apart.
+"""Real pairs with known geometry at 3072x2048: two of Herz-Jesus-P8 7 degrees apart, two 42 apart, two of a castle.
 
 Recorded with xfeat-star and coseg of two images at their defaults: on the near pair 6 areas kept, 6,000 matches by
 areas and 3,000 by the plain matcher; on the far one 2,000 matches within a pixel with warped crops, 1,100 without. The
