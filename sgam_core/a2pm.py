@@ -24,7 +24,7 @@ from sgam_core.protocols import AreaMatcher, PointMatcher
 from sgam_core.rejection import reject
 from sgam_core.semantic import SemanticAreaMatcher
 from sgam_core.support import supported
-from sgam_core.types import AreaState, Image, Matches, PairResult, PutativeAreas, TwoViewModel
+from sgam_core.types import AreaMatch, AreaState, Image, Matches, PairResult, PutativeAreas, TwoViewModel
 from sgam_core.uniqueness import without_contradictions
 
 
