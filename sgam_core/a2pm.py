@@ -217,7 +217,7 @@ def _inside(matches: Matches, areas: Sequence[AreaMatch]) -> Matches:
     """The matches that lie in any of the area matches."""
     inside = np.zeros(len(matches), bool)
     for area in areas:
-        inside |= area.area0.box.contains(matches.points0) & area.area1.box.contains(matches.points1)
+        inside |= area.joins(matches)
     return matches.select(inside)
 
 

@@ -92,7 +92,7 @@ def warp_between(matches: Matches, area: AreaMatch, options: GuidanceOptions) ->
 
     Seen through it, what is slanted in one image alone looks alike in both.
     """
-    chosen = matches.select(area.area0.box.contains(matches.points0) & area.area1.box.contains(matches.points1))
+    chosen = matches.select(area.joins(matches))
     if len(chosen) < max(options.min_matches, 4) or not options.max_bend:  # three fit any map
         return None
     affine, _ = cv2.estimateAffine2D(chosen.points0, chosen.points1, method=cv2.LMEDS)

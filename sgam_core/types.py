@@ -406,6 +406,10 @@ class AreaMatch:
     num_matches: int = 0
     num_inliers: int = 0
 
+    def joins(self, matches: Matches) -> Bool[np.ndarray, " M"]:
+        """Which matches, in image pixels, lie in both areas."""
+        return self.area0.box.contains(matches.points0) & self.area1.box.contains(matches.points1)
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PutativeAreas:

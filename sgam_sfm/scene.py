@@ -6,9 +6,7 @@ Pixels are (x, y) with corner origin; depth is along the camera's z axis; metres
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 from pathlib import Path
 
@@ -24,6 +22,7 @@ from sgam_sfm.room import furnished_room
 from sgam_sfm.room.furniture import LABELS
 from sgam_sfm.room.rendering import Rendering, View, looking, render
 from sgam_sfm.room.shapes import lookup
+from sgam_sfm.threads import in_order, num_cores
 
 __all__ = ["Rendering", "View", "correspond", "demo_views", "depth_at", "overlap", "render", "write_scene"]
 
@@ -142,11 +141,10 @@ def write_scene(
     for name in ("images", "labels", "ground_truth"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     shown = []
-    with ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, 4)) as pool:
-        for view, rendering in zip(views, pool.map(render, views), strict=True):
-            _write_view(folder, view, rendering)
-            shown.append((view, rendering))
-            advance(view)
+    for view, rendering in zip(views, in_order(render, views, min(num_cores(), 4)), strict=True):
+        _write_view(folder, view, rendering)
+        shown.append((view, rendering))
+        advance(view)
     write_label_names(folder / "labels")
     write_ground_truth(folder / "ground_truth", views)
     pairs = [
