@@ -65,7 +65,7 @@ class CovisibleAreaMatcher:
 
     def crop(self, image: Image, box: Box, options: CropOptions) -> Crop:
         """The box itself, at least at the size of a whole image, which it replaces."""
-        return box_crop(image, box, max(options.image_size, options.area_size), upsample=options.upsample)
+        return box_crop(image, box, max(options.image_size, options.area_size), options.max_upsampling)
 
 
 def consistent(matches: Matches, frame0: Frame, frame1: Frame, geometry: GeometryOptions) -> Matches:

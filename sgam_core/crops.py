@@ -14,7 +14,8 @@ from sgam_core.types import Box, Crop, Image, WarpedCrop
 
 def whole_crop(image: Image, options: CropOptions) -> Crop:
     """The whole image, its long side at most `image_size`."""
-    return _crop(image, Box(x0=0, y0=0, x1=image.width, y1=image.height), options.image_size, upsample=False)
+    window = Box(x0=0, y0=0, x1=image.width, y1=image.height)
+    return _crop(image, window, options.image_size, options.max_whole_upsampling)
 
 
 def area_crop(image: Image, box: Box, options: CropOptions) -> Crop:
@@ -23,14 +24,17 @@ def area_crop(image: Image, box: Box, options: CropOptions) -> Crop:
     x, y = box.center
     x0, x1 = _window(x, side, image.width)
     y0, y1 = _window(y, side, image.height)
-    return _crop(image, Box(x0=x0, y0=y0, x1=x1, y1=y1), options.area_size, upsample=options.upsample)
+    return _crop(image, Box(x0=x0, y0=y0, x1=x1, y1=y1), options.area_size, options.max_upsampling)
 
 
-def box_crop(image: Image, box: Box, long_side: int, *, upsample: bool) -> Crop:
-    """The box itself, out to whole pixels of the image, its long side at most `long_side` (with upsample: exactly)."""
+def box_crop(image: Image, box: Box, long_side: int, max_upsampling: float) -> Crop:
+    """The box itself, out to whole pixels of the image, its long side at most `long_side`.
+
+    Args: max_upsampling: as in `CropOptions`.
+    """
     x0, x1 = whole_pixels(box.x0, box.x1, image.width)
     y0, y1 = whole_pixels(box.y0, box.y1, image.height)
-    return _crop(image, Box(x0=x0, y0=y0, x1=x1, y1=y1), long_side, upsample=upsample)
+    return _crop(image, Box(x0=x0, y0=y0, x1=x1, y1=y1), long_side, max_upsampling)
 
 
 def warped_alike(crop0: Crop, crop1: Crop, image1_from_image0: Float[np.ndarray, "2 3"]) -> tuple[Crop, Crop]:
@@ -75,10 +79,8 @@ def _window(center: float, side: float, length: int) -> tuple[int, int]:
     return start, start + extent
 
 
-def _crop(image: Image, window: Box, long_side: int, *, upsample: bool) -> Crop:
-    scale = long_side / max(window.width, window.height)
-    if not upsample:
-        scale = min(scale, 1.0)
+def _crop(image: Image, window: Box, long_side: int, max_upsampling: float) -> Crop:
+    scale = min(long_side / max(window.width, window.height), max_upsampling or math.inf)
     return Crop(
         image=image,
         window=window,

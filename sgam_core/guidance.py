@@ -2,7 +2,8 @@
 
 Not in the paper, whose areas are matched once at one size. What a crop gains over the whole image is resolution, so a
 second round spends its pixels on the ground that both images share and nowhere twice: few windows that cover it, of
-both images at the scale at which things have one size, up to the resolution of the coarser one.
+both images at the scale at which things have one size, up to twice the resolution of the coarser one: networks whose
+cells are many pixels wide place points more exactly in an enlarged image, though that shows nothing new.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _STRAY = 0.05  # a smaller share of a window's matches is no reason to look ther
 class _Window:
     """What some matches enclose in both images.
 
-    scales: of its crops, matcher pixels per image pixel, at most 1. sigma: of the matches, image pixels per matcher
+    scales: of its crops, matcher pixels per image pixel. sigma: of the matches, image pixels per matcher
     pixel.
     """
 
@@ -69,9 +70,10 @@ def guided_areas(
     if len(matches) < max(options.min_matches, 1):
         return ()
     rows = np.arange(len(matches))
-    whole = _window(matches, rows, frame0, frame1, options)
-    largest = crop.area_size / _within_budget([whole], crop)
-    windows = _split(matches, rows, frame0, frame1, largest, options)
+    finest = options.max_upsampling or crop.area_size  # without a limit: a pixel fills a crop
+    whole = _window(matches, rows, frame0, frame1, options).resized(finest)
+    largest = crop.area_size / _within_budget([whole], crop) / finest
+    windows = [window.resized(finest) for window in _split(matches, rows, frame0, frame1, largest, options)]
     fitting = [window.resized(min(1.0, crop.area_size / max(window.sides))) for window in windows]
     factor = _within_budget(fitting, crop)
     finer = [window for window in (window.resized(factor) for window in fitting) if window.gain >= options.min_gain]
@@ -123,7 +125,7 @@ def _split(
     largest: float,
     options: GuidanceOptions,
 ) -> Sequence[_Window]:
-    """Windows no side of whose crops exceeds `largest`, halved where they would."""
+    """Windows at their images' own resolution, no side of whose crops exceeds `largest`, halved where they would."""
     window = _window(matches, rows, frame0, frame1, options)
     sides = window.sides
     longest = int(np.argmax(sides))

@@ -34,6 +34,11 @@ class _Checked:
         if not low <= (value := getattr(self, name)) <= high:
             raise OptionError(f"{name} is {value}; expected a number from {low} to {high}")
 
+    def _is_upsampling(self, *names: str) -> None:
+        for name in names:
+            if 0 < (value := getattr(self, name)) < 1:
+                raise OptionError(f"{name} is {value}; expected at least 1 (never enlarge), or 0 (without limit)")
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class CropOptions(_Checked):
@@ -49,8 +54,15 @@ class CropOptions(_Checked):
     """Side of the crop over the long side of its area."""
     keep: float = 1.1
     """Matches are kept inside the area's box enlarged by this (the paper: 1.0)."""
-    upsample: bool = False
-    """Enlarge a crop beyond the image's own resolution to reach area_size (the paper does)."""
+    max_upsampling: float = 1.0
+    """Areas are enlarged to reach area_size, to at most so many times their image's resolution (1: never; 0: without
+    limit, as in the paper)."""
+    max_whole_upsampling: float = 1.0
+    """The same for whole images and image_size."""
+
+    def __post_init__(self) -> None:
+        _Checked.__post_init__(self)
+        self._is_upsampling("max_upsampling", "max_whole_upsampling")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -277,6 +289,12 @@ class GuidanceOptions(_Checked):
     from it, share of the window's long side (0: no crop is warped)."""
     min_gain: float = 1.1
     """Crops are to be finer than the first round's matches by at least this factor."""
+    max_upsampling: float = 2.0
+    """Crops have at most so many times the resolution of the coarser image (1: none is enlarged; 0: no limit)."""
+
+    def __post_init__(self) -> None:
+        _Checked.__post_init__(self)
+        self._is_upsampling("max_upsampling")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -338,7 +356,7 @@ PAPER = changed(
     crop__area_size=480,
     crop__expand=1.0,
     crop__keep=1.0,
-    crop__upsample=True,
+    crop__max_upsampling=0,
     crop__max_crop_pixels=0,
     semantic__intersections__min_labels=4,
     semantic__intersections__max_distance=0.75,

@@ -36,7 +36,7 @@ class PairPoints:
         area_crop: Callable[[Image, Box, CropOptions], Crop],
     ) -> None:
         self.images, self.matcher, self.options, self.area_crop = (image0, image1), matcher, options, area_crop
-        size0, size1 = (min(options.image_size, max(image.width, image.height)) for image in self.images)
+        size0, size1 = (max(whole_crop(image, options).size) for image in self.images)
         self.look = Look(sizes=(size0, size1))
         self.pixels = self.pixels_of_areas = 0
         self.seconds = 0.0
@@ -189,7 +189,7 @@ def _require_as_agreed(matcher: PointMatcher, crops: Sequence[tuple[Crop, Crop]]
 
 
 def _scaled_crop(image: Image, box: Box, scale: float) -> Crop:
-    return box_crop(image, box, max(round(scale * max(box.width, box.height)), 1), upsample=False)
+    return box_crop(image, box, max(round(scale * max(box.width, box.height)), 1), max_upsampling=0)
 
 
 def _limit_candidates(groups: Sequence[Sequence[AreaMatch]], max_candidates: int) -> list[list[AreaMatch]]:

@@ -61,7 +61,7 @@ class TileAreaMatcher:
 
     def crop(self, image: Image, box: Box, options: CropOptions) -> Crop:
         """The tile itself, its long side at most `area_size`."""
-        return box_crop(image, box, options.area_size, upsample=options.upsample)
+        return box_crop(image, box, options.area_size, options.max_upsampling)
 
 
 def grid(width: int, height: int, options: TileOptions) -> tuple[Box, ...]:

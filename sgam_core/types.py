@@ -284,7 +284,7 @@ def _resize(array: np.ndarray, size: tuple[int, int], *, smooth: bool) -> np.nda
     if size == (array.shape[1], array.shape[0]):
         return np.ascontiguousarray(array)
     shrinks = size[0] < array.shape[1] or size[1] < array.shape[0]
-    method = cv2.INTER_NEAREST_EXACT if not smooth else cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    method = cv2.INTER_NEAREST_EXACT if not smooth else cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
     while smooth and _can_be_halved(array, size):
         array = cv2.resize(array, (array.shape[1] // 2, array.shape[0] // 2), interpolation=cv2.INTER_AREA)
     return cv2.resize(array, size, interpolation=method)

@@ -41,6 +41,8 @@ def fit_budget(
 ) -> Budget:
     """The options with the size of whole images, or of areas, at which `target` pixels are matched over all pairs.
 
+    Either is enlarged as far as guided areas may be.
+
     Args: whole_matches: of the pairs at the options' image size, for area matchers that start from them; without areas
         they are not looked at. max_image_size: the largest size that memory allows for a whole image.
     """
@@ -49,16 +51,19 @@ def fit_budget(
     proposed = {
         (a, b): _propose(area_matcher, blank[a], blank[b], whole_matches.get((a, b), Matches.empty())) for a, b in pairs
     }
-    native = max(max(file.width, file.height) for file in images.values())
-    if any(areas.confident or areas.doubtful for areas in proposed.values()):
-        name, largest, limit = "area_size", native, "the images' own resolution"
-    else:
-        name, largest = "image_size", min(native, max_image_size)
-        limit = "the images' own resolution" if largest == native else "--budget-image-size"
+    enlarged = options.guidance.max_upsampling or 1.0  # without a limit there is none to be fair to
+    finest = int(max(max(file.width, file.height) for file in images.values()) * enlarged)
+    limit = "the images' own resolution" if enlarged == 1 else f"{enlarged:g} times the images' own resolution"
+    name, largest = "area_size", finest
+    if not any(areas.confident or areas.doubtful for areas in proposed.values()):
+        name, largest = "image_size", min(finest, max_image_size)
+        limit = limit if largest == finest else "--budget-image-size"
 
     def crop_options(size: int) -> CropOptions:
         crop = replace(options.crop, max_crop_pixels=0)
-        return replace(crop, area_size=size) if name == "area_size" else replace(crop, image_size=size)
+        if name == "area_size":
+            return replace(crop, area_size=size, max_upsampling=enlarged)
+        return replace(crop, image_size=size, max_whole_upsampling=enlarged)
 
     def pixels(size: int) -> int:
         crops = crop_options(size)

@@ -43,15 +43,22 @@ def test_whole_images_grow_until_the_pixels_are_spent():
     assert (budget.reached, budget.cap) == (target, "")
 
 
+def test_whole_images_are_enlarged_where_areas_may_be():
+    target = 2 * 2 * 3000 * 1500
+    assert fit_budget(OPTIONS, IMAGES, PAIRS, target, WholeImages(), {}, 4096).reached == target
+
+
 @pytest.mark.parametrize(
-    ("largest", "cap"),
+    ("largest", "max_upsampling", "cap"),
     [
-        (4096, "capped at the images' own resolution (image-size 2000)"),
-        (1200, "capped at --budget-image-size (image-size 1200)"),
+        (4096, 1.0, "capped at the images' own resolution (image-size 2000)"),
+        (4096, 2.0, "capped at 2 times the images' own resolution (image-size 4000)"),
+        (1200, 2.0, "capped at --budget-image-size (image-size 1200)"),
     ],
 )
-def test_a_cap_that_bites_is_told(largest, cap):
-    budget = fit_budget(OPTIONS, IMAGES, PAIRS, 10**9, WholeImages(), {}, largest)
+def test_a_cap_that_bites_is_told(largest, max_upsampling, cap):
+    options = replace(OPTIONS, guidance=replace(OPTIONS.guidance, max_upsampling=max_upsampling))
+    budget = fit_budget(options, IMAGES, PAIRS, 10**9, WholeImages(), {}, largest)
     assert budget.cap == cap
     assert budget.reached < budget.target
 

@@ -24,14 +24,14 @@ def image(width: int, height: int, **more) -> Image:
     st.floats(0.01, 1),
     st.floats(0.01, 1),
     st.integers(1, 700),
-    st.booleans(),
+    st.just(0) | st.floats(1, 5),
 )
-def test_crop_then_uncrop_is_the_identity(width, height, x, y, w, h, area_size, upsample):
+def test_crop_then_uncrop_is_the_identity(width, height, x, y, w, h, area_size, max_upsampling):
     box = Box(x0=x * width, y0=y * height, x1=(x + w) * width, y1=(y + h) * height)
     crop = area_crop(
         Image(name="a", pixels=np.zeros((height, width, 3), np.uint8)),
         box,
-        CropOptions(area_size=area_size, upsample=upsample),
+        CropOptions(area_size=area_size, max_upsampling=max_upsampling),
     )
     assert 0 <= crop.window.x0 < crop.window.x1 <= width
     assert 0 <= crop.window.y0 < crop.window.y1 <= height
@@ -42,8 +42,8 @@ def test_crop_then_uncrop_is_the_identity(width, height, x, y, w, h, area_size, 
     np.testing.assert_allclose(crop.to_image(there), points, atol=1e-6)
     corners = np.array([[crop.window.x0, crop.window.y0], [crop.window.x1, crop.window.y1]])
     np.testing.assert_allclose(corners @ affine[:, :2].T + affine[:, 2], [[0, 0], list(crop.size)], atol=1e-6)
-    if not upsample:
-        assert crop.scale <= 1.0
+    if max_upsampling:
+        assert crop.scale <= max_upsampling + 1 / min(crop.window.width, crop.window.height)  # whole pixels
 
 
 def test_a_crop_is_a_square_about_its_area_at_the_images_own_resolution():
@@ -134,7 +134,7 @@ SIZE = (400, 300)
 def test_crops_that_are_warped_look_alike(affine):
     images = [Image(name=str(row), pixels=view(seen, SIZE)) for row, seen in enumerate((np.eye(3), affine))]
     boxes = Box(x0=90, y0=60, x1=290, y1=240), Box(x0=70, y0=30, x1=330, y1=260)
-    crops = [box_crop(image, box, 220, upsample=False) for image, box in zip(images, boxes, strict=True)]
+    crops = [box_crop(image, box, 220, 1) for image, box in zip(images, boxes, strict=True)]
     alike = warped_alike(*crops, affine[:2])
     assert sum(isinstance(crop, WarpedCrop) for crop in alike) == 1
     assert alike[0].size == alike[1].size
@@ -212,7 +212,7 @@ def test_a_crop_that_is_turned_aslant_looks_so():
 @pytest.mark.parametrize("long_side", [40, 200, 420])
 def test_the_gray_of_a_crop_is_that_of_its_pixels(long_side, degrees):
     shown = Image(name="a", pixels=view(np.eye(3), (240, 180)))
-    crop = box_crop(shown, Box(x0=20, y0=30, x1=220, y1=140), long_side, upsample=True).turned(degrees)
+    crop = box_crop(shown, Box(x0=20, y0=30, x1=220, y1=140), long_side, 0).turned(degrees)
     expected = cv2.cvtColor(crop.pixels(), cv2.COLOR_RGB2GRAY)
     assert crop.gray().dtype == np.uint8
     # Each is rounded twice or three times.

@@ -57,26 +57,37 @@ def test_windows_cover_the_overlap_within_the_limits(factor, shift, size):
     assert np.any(covered, axis=0).mean() > 0.75  # the outermost matches are left out
 
 
+@pytest.mark.parametrize("max_upsampling", [1.0, 2.0])
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
-def test_things_have_one_size_in_both_crops_and_neither_is_enlarged(factor):
-    areas = guided_areas(zoomed(factor), FRAME, FRAME, CROP, GuidanceOptions())
+def test_things_have_one_size_in_both_crops_and_neither_is_enlarged_too_much(factor, max_upsampling):
+    options = GuidanceOptions(max_upsampling=max_upsampling)
+    areas = guided_areas(zoomed(factor), FRAME, FRAME, CROP, options)
     assert len(areas) > 1
     for area in areas:
         assert area.scale0 / area.scale1 == pytest.approx(factor, rel=1e-6)
-        assert max(area.scale0, area.scale1) <= 1
+        assert max(area.scale0, area.scale1) <= max_upsampling
 
 
-def test_more_pixels_are_spent_up_to_the_resolution_of_the_images():
+@pytest.mark.parametrize("max_upsampling", [1.0, 1.5])
+def test_more_pixels_are_spent_as_far_as_images_may_be_enlarged(max_upsampling):
+    options = GuidanceOptions(max_upsampling=max_upsampling)
     few, many = (
-        guided_areas(zoomed(1), FRAME, FRAME, replace(CROP, max_crop_pixels=pixels), GuidanceOptions())
+        guided_areas(zoomed(1), FRAME, FRAME, replace(CROP, max_crop_pixels=pixels), options)
         for pixels in (2_000_000, 0)
     )
     assert len(few) < len(many)
     assert max(area.scale0 for area in few) < 0.6
-    assert max(area.scale0 for area in many) == 1
+    assert max(area.scale0 for area in many) == pytest.approx(max_upsampling)
 
 
-@pytest.mark.parametrize("matches", [zoomed(1, count=19), zoomed(1, sigma=1.0), Matches.empty()])
+def test_without_limits_every_crop_is_as_large_as_may_be():
+    crop = CropOptions(area_size=640, max_crop_pixels=0)
+    areas = guided_areas(zoomed(1), FRAME, FRAME, crop, GuidanceOptions(max_upsampling=0))
+    assert crop_sides(areas).max(axis=(1, 2)) == pytest.approx(640)
+    assert max(area.scale0 for area in areas) > 1.5
+
+
+@pytest.mark.parametrize("matches", [zoomed(1, count=19), zoomed(1, sigma=0.5), Matches.empty()])
 def test_no_window_with_few_matches_or_without_a_gain_in_resolution(matches):
     assert guided_areas(matches, FRAME, FRAME, CROP, GuidanceOptions()) == ()
 
@@ -190,7 +201,7 @@ def test_only_crops_whose_size_was_measured_are_said_to_be_alike(room, max_bend)
 
 
 def test_images_without_more_resolution_cost_what_they_cost_plainly(room):
-    options = changed(SGAMOptions(), crop__image_size=640)
+    options = changed(SGAMOptions(), crop__image_size=640, guidance__max_upsampling=1)
     found = in_room(room, options)
     images = [room.images[name] for name in ("view03.jpg", "view04.jpg")]
     plain = match_whole(*images, TrueMatcher(room), options.crop)
