@@ -63,7 +63,7 @@ def main() -> None:
     arguments = parser.parse_args(own)
     for run in arguments.runs:
         compare(arguments.data, arguments.out, run, passed_on)
-    print(table({run: arguments.out / folder_of(run) for run in RUNS}))
+    print(table({run: arguments.out / folder_of(run) for run in dict.fromkeys([*RUNS, *arguments.runs])}))
 
 
 def compare(data: Path, out: Path, run: str, options: list[str]) -> None:

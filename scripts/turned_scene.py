@@ -14,7 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image
+from scenes import strecha_views
 
 
 def main() -> None:
@@ -24,23 +24,13 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--degrees", type=float, default=45.0, help="anticlockwise, of every other photo")
     arguments = parser.parse_args()
-    folders = [arguments.out / name for name in ("images", "gt_dense_cameras")]
-    for folder in folders:
-        folder.mkdir(parents=True, exist_ok=True)
-    for number, path in enumerate(sorted((arguments.scene / "gt_dense_cameras").glob("*.camera"))):
-        values = np.loadtxt(path.read_text().split())
-        K, camera_to_world, size = values[:9].reshape(3, 3), values[12:21].reshape(3, 3), values[24:]
-        name = path.name.removesuffix(".camera")
-        pixels = np.asarray(Image.open(arguments.scene / "images" / name))
-        cut, turn = turned_camera(K, size, arguments.degrees if number % 2 else 0.0)
+    for number, view in enumerate(strecha_views(arguments.scene)):
+        size = np.array(view.pixels.shape[1::-1])
+        cut, turn = turned_camera(view.K, size, arguments.degrees if number % 2 else 0.0)
         width, height = (int(2 * center + 1) for center in cut[:2, 2])
-        affine = (cut @ turn @ np.linalg.inv(K))[:2]
-        turned = cv2.warpAffine(pixels, affine, (width, height), flags=cv2.INTER_CUBIC)
-        Image.fromarray(turned).save(folders[0] / name, quality=98)
-        rows = [*cut, np.zeros(3), *(camera_to_world @ turn.T), values[21:24], np.array([width, height])]
-        lines = [" ".join(f"{value:.10g}" for value in row) for row in rows]
-        (folders[1] / path.name).write_text("\n".join(lines) + "\n")
-    np.savetxt(folders[0] / "K.txt", cut)  # one camera took them all
+        affine = (cut @ turn @ np.linalg.inv(view.K))[:2]
+        turned = cv2.warpAffine(view.pixels, affine, (width, height), flags=cv2.INTER_CUBIC)
+        view.seen(turned, cut, turn).write(arguments.out)
 
 
 def turned_camera(K: np.ndarray, size: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:

@@ -383,6 +383,7 @@ FAST = changed(
     semantic__intersections__enabled=False,
     prediction__max_candidates=3,
     guidance__min_gain=1.2,
+    guidance__max_upsampling=1.0,
 )
 """At most half more time than whole images take: few areas, where whole images do not agree, and a second round only
 where it is a fifth finer."""
