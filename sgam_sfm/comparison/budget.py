@@ -16,6 +16,7 @@ from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
 
 _SMALLEST = 64
+_MOST_ENLARGED = 8.0  # where guided areas have no limit
 
 Cut = Callable[[Image, Box, CropOptions], Crop]
 
@@ -51,7 +52,7 @@ def fit_budget(
     proposed = {
         (a, b): _propose(area_matcher, blank[a], blank[b], whole_matches.get((a, b), Matches.empty())) for a, b in pairs
     }
-    enlarged = options.guidance.max_upsampling or 1.0  # without a limit there is none to be fair to
+    enlarged = options.guidance.max_upsampling or _MOST_ENLARGED
     finest = int(max(max(file.width, file.height) for file in images.values()) * enlarged)
     limit = "the images' own resolution" if enlarged == 1 else f"{enlarged:g} times the images' own resolution"
     name, largest = "area_size", finest

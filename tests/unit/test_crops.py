@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sgam_core.crops import area_crop, box_crop, warped_alike, whole_crop
-from sgam_core.errors import ShapeError
-from sgam_core.options import CropOptions
+from sgam_core.errors import OptionError, ShapeError
+from sgam_core.options import CropOptions, GuidanceOptions
 from sgam_core.types import Box, Image, WarpedCrop
 from tests.textures import similarity, transfer, view
 
@@ -44,6 +44,24 @@ def test_crop_then_uncrop_is_the_identity(width, height, x, y, w, h, area_size, 
     np.testing.assert_allclose(corners @ affine[:, :2].T + affine[:, 2], [[0, 0], list(crop.size)], atol=1e-6)
     if max_upsampling:
         assert crop.scale <= max_upsampling + 1 / min(crop.window.width, crop.window.height)  # whole pixels
+
+
+@pytest.mark.parametrize("make", [CropOptions, GuidanceOptions])
+def test_a_limit_of_enlarging_that_would_shrink_is_refused(make):
+    with pytest.raises(OptionError, match=r"max_upsampling is 0.5; expected at least 1 \(never enlarge\), or 0"):
+        make(max_upsampling=0.5)
+
+
+def test_small_images_are_enlarged_only_where_that_is_asked_for():
+    small = image(300, 200)
+    assert whole_crop(small, CropOptions(image_size=1024)).size == (300, 200)
+    assert whole_crop(small, CropOptions(image_size=1024, max_whole_upsampling=2)).size == (600, 400)
+    assert whole_crop(small, CropOptions(image_size=450, max_whole_upsampling=0)).size == (450, 300)
+    box = Box(x0=0, y0=0, x1=100, y1=50)
+    assert box_crop(small, box, 800, 1).size == (100, 50)
+    assert box_crop(small, box, 800, 2).size == (200, 100)
+    enlarged = box_crop(small, box, 800, 0)
+    assert enlarged.size == enlarged.gray().shape[::-1] == (800, 400)
 
 
 def test_a_crop_is_a_square_about_its_area_at_the_images_own_resolution():
