@@ -21,6 +21,7 @@ from sgam_sfm.colmap.pose_errors import compare_poses
 from sgam_sfm.colmap.reading import database_content
 from sgam_sfm.exit_codes import DONE, ERROR, SOME_FAILED, USAGE
 from sgam_sfm.runs.matching import CollectionMatcher
+from sgam_sfm.runs.store import read_pairs_of
 from sgam_sfm.scene import write_ground_truth
 from tests.room import Room, write_room
 
@@ -205,9 +206,19 @@ def test_masked_ground_has_no_match(room, folder, tmp_path):
     output = tmp_path / "out"
     code = cli.run(arguments(folder, output, "--no-mapping", "--mask-path", str(masks)))
     assert code == DONE
-    points = np.concatenate([np.array(p) for p in database_content(output / "database.db")["keypoints"].values() if p])
-    assert len(points) > 200
-    assert points[:, 0].min() > 640 // 2 - 3  # keypoints are means of several points
+    coarsest: dict[str, float] = {}  # image pixels per matcher pixel
+    for record in read_pairs_of(output):
+        found = record.result.matches
+        for name, points, sigmas in zip(
+            record.pair, (found.points0, found.points1), (found.sigmas0, found.sigmas1), strict=True
+        ):
+            if len(points):
+                assert points[:, 0].min() > 640 // 2 - 0.5
+                coarsest[name] = max(coarsest.get(name, 0.0), float(sigmas.max()))
+    keypoints = database_content(output / "database.db")["keypoints"]
+    assert sum(map(len, keypoints.values())) > 200
+    for name, points in keypoints.items():  # which settle where all matches of their tracks agree
+        assert not points or min(x for x, _ in points) > 640 // 2 - coarsest[name]
 
 
 def test_masks_that_are_missing_named_otherwise_or_of_another_size_are_told_at_once(room, folder, tmp_path, capsys):
