@@ -2,8 +2,8 @@
 
 Not in the paper, whose areas are matched once at one size. What a crop gains over the whole image is resolution, so a
 second round spends its pixels on the ground that both images share and nowhere twice: few windows that cover it, of
-both images at the scale at which things have one size, up to twice the resolution of the coarser one: networks whose
-cells are many pixels wide place points more exactly in an enlarged image, though that shows nothing new.
+both images at the scale at which things have one size, up to the resolution of the coarser one. Small photos, of which
+the first round has seen all, are enlarged: networks whose cells are many pixels wide place points more exactly so.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def guided_areas(
     if len(matches) < max(options.min_matches, 1):
         return ()
     rows = np.arange(len(matches))
-    finest = options.max_upsampling or crop.area_size  # without a limit: a pixel fills a crop
+    finest = _enlarged(frame0, frame1, crop, options)
     whole = _window(matches, rows, frame0, frame1, options).resized(finest)
     largest = crop.area_size / _within_budget([whole], crop) / finest
     windows = [window.resized(finest) for window in _split(matches, rows, frame0, frame1, largest, options)]
@@ -87,6 +87,14 @@ def guided_areas(
         )
         for window in finer
     )
+
+
+def _enlarged(frame0: Frame, frame1: Frame, crop: CropOptions, options: GuidanceOptions) -> float:
+    """Crop pixels per image pixel at most: 1 where whole images are seen at much less than their own resolution."""
+    if not options.max_upsampling:
+        return crop.area_size  # a pixel fills a crop
+    longest = max(frame0.width, frame0.height, frame1.width, frame1.height)
+    return max(1.0, options.max_upsampling * min(1.0, crop.image_size / longest))
 
 
 def warp_between(matches: Matches, area: AreaMatch, options: GuidanceOptions) -> Float[np.ndarray, "2 3"] | None:

@@ -290,7 +290,8 @@ class GuidanceOptions(_Checked):
     min_gain: float = 1.1
     """Crops are to be finer than the first round's matches by at least this factor."""
     max_upsampling: float = 2.0
-    """Crops have at most so many times the resolution of the coarser image (1: none is enlarged; 0: no limit)."""
+    """Small photos are enlarged: crops may be so many times as fine as whole images are seen, where the photos' own
+    resolution is less (1: none is enlarged; 0: without limit)."""
 
     def __post_init__(self) -> None:
         _Checked.__post_init__(self)

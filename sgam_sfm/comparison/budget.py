@@ -52,8 +52,10 @@ def fit_budget(
     proposed = {
         (a, b): _propose(area_matcher, blank[a], blank[b], whole_matches.get((a, b), Matches.empty())) for a, b in pairs
     }
-    enlarged = options.guidance.max_upsampling or _MOST_ENLARGED
-    finest = int(max(max(file.width, file.height) for file in images.values()) * enlarged)
+    native = max(max(file.width, file.height) for file in images.values())
+    seen = min(native, options.crop.image_size)
+    finest = max(native, int(seen * (options.guidance.max_upsampling or _MOST_ENLARGED)))
+    enlarged = finest / native
     limit = "the images' own resolution" if enlarged == 1 else f"{enlarged:g} times the images' own resolution"
     name, largest = "area_size", finest
     if not any(areas.confident or areas.doubtful for areas in proposed.values()):

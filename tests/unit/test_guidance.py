@@ -61,7 +61,7 @@ def test_windows_cover_the_overlap_within_the_limits(factor, shift, size):
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
 def test_things_have_one_size_in_both_crops_and_neither_is_enlarged_too_much(factor, max_upsampling):
     options = GuidanceOptions(max_upsampling=max_upsampling)
-    areas = guided_areas(zoomed(factor), FRAME, FRAME, CROP, options)
+    areas = guided_areas(zoomed(factor), FRAME, FRAME, replace(CROP, image_size=3000), options)
     assert len(areas) > 1
     for area in areas:
         assert area.scale0 / area.scale1 == pytest.approx(factor, rel=1e-6)
@@ -72,12 +72,19 @@ def test_things_have_one_size_in_both_crops_and_neither_is_enlarged_too_much(fac
 def test_more_pixels_are_spent_as_far_as_images_may_be_enlarged(max_upsampling):
     options = GuidanceOptions(max_upsampling=max_upsampling)
     few, many = (
-        guided_areas(zoomed(1), FRAME, FRAME, replace(CROP, max_crop_pixels=pixels), options)
+        guided_areas(zoomed(1), FRAME, FRAME, replace(CROP, image_size=3000, max_crop_pixels=pixels), options)
         for pixels in (2_000_000, 0)
     )
     assert len(few) < len(many)
     assert max(area.scale0 for area in few) < 0.6
     assert max(area.scale0 for area in many) == pytest.approx(max_upsampling)
+
+
+@pytest.mark.parametrize(("image_size", "finest"), [(1000, 1.0), (1500, 1.0), (2400, 1.6), (4000, 2.0)])
+def test_photos_are_enlarged_to_be_twice_as_fine_as_the_first_round_saw_them(image_size, finest):
+    crop = CropOptions(area_size=8000, image_size=image_size, max_crop_pixels=0)
+    areas = guided_areas(zoomed(1), FRAME, FRAME, crop, GuidanceOptions())
+    assert max(area.scale0 for area in areas) == pytest.approx(finest)
 
 
 def test_without_limits_every_crop_is_as_large_as_may_be():
