@@ -70,7 +70,7 @@ def guided_areas(
     if len(matches) < max(options.min_matches, 1):
         return ()
     rows = np.arange(len(matches))
-    finest = _enlarged(frame0, frame1, crop, options)
+    finest = most_enlarged(max(frame0.width, frame0.height, frame1.width, frame1.height), crop, options)
     whole = _window(matches, rows, frame0, frame1, options).resized(finest)
     largest = crop.area_size / _within_budget([whole], crop) / finest
     windows = [window.resized(finest) for window in _split(matches, rows, frame0, frame1, largest, options)]
@@ -89,11 +89,13 @@ def guided_areas(
     )
 
 
-def _enlarged(frame0: Frame, frame1: Frame, crop: CropOptions, options: GuidanceOptions) -> float:
-    """Crop pixels per image pixel at most: 1 where whole images are seen at much less than their own resolution."""
+def most_enlarged(longest: int, crop: CropOptions, options: GuidanceOptions) -> float:
+    """Crop pixels per image pixel at most: 1 where whole images are seen at much less than their own resolution.
+
+    Args: longest: side of the images, pixels.
+    """
     if not options.max_upsampling:
         return crop.area_size  # a pixel fills a crop
-    longest = max(frame0.width, frame0.height, frame1.width, frame1.height)
     return max(1.0, options.max_upsampling * min(1.0, crop.image_size / longest))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from sgam_core import AreaMatcher, Image, Matches
 from sgam_core.crops import area_crop, whole_crop
+from sgam_core.guidance import most_enlarged
 from sgam_core.options import CropOptions
 from sgam_core.types import Box, Crop, PutativeAreas
 from sgam_sfm.images import ImageFile
@@ -16,7 +17,6 @@ from sgam_sfm.options import MatchOptions
 from sgam_sfm.pairs import Pair
 
 _SMALLEST = 64
-_MOST_ENLARGED = 8.0  # where guided areas have no limit
 
 Cut = Callable[[Image, Box, CropOptions], Crop]
 
@@ -53,9 +53,8 @@ def fit_budget(
         (a, b): _propose(area_matcher, blank[a], blank[b], whole_matches.get((a, b), Matches.empty())) for a, b in pairs
     }
     native = max(max(file.width, file.height) for file in images.values())
-    seen = min(native, options.crop.image_size)
-    finest = max(native, int(seen * (options.guidance.max_upsampling or _MOST_ENLARGED)))
-    enlarged = finest / native
+    enlarged = most_enlarged(native, options.crop, options.guidance)
+    finest = round(native * enlarged)
     limit = "the images' own resolution" if enlarged == 1 else f"{enlarged:g} times the images' own resolution"
     name, largest = "area_size", finest
     if not any(areas.confident or areas.doubtful for areas in proposed.values()):

@@ -94,7 +94,7 @@ def test_without_limits_every_crop_is_as_large_as_may_be():
     assert max(area.scale0 for area in areas) > 1.5
 
 
-@pytest.mark.parametrize("matches", [zoomed(1, count=19), zoomed(1, sigma=0.5), Matches.empty()])
+@pytest.mark.parametrize("matches", [zoomed(1, count=19), zoomed(1, sigma=1.0), Matches.empty()])
 def test_no_window_with_few_matches_or_without_a_gain_in_resolution(matches):
     assert guided_areas(matches, FRAME, FRAME, CROP, GuidanceOptions()) == ()
 
