@@ -6,6 +6,7 @@ import hashlib
 import io
 import os
 import struct
+import sys
 import threading
 import unicodedata
 import warnings
@@ -164,21 +165,24 @@ def read_image(file: ImageFile | Path, max_size: int = MAX_IMAGE_SIZE) -> UInt8[
     return _rgb(_decode(_read(file, "image"), file.name, max_size), file.name)
 
 
-def read_mask(mask_folder: Path, image: ImageFile) -> Bool[np.ndarray, "H W"] | None:
+def read_mask(mask_folder: Path, image: ImageFile | str) -> Bool[np.ndarray, "H W"] | None:
     """The mask of an image by COLMAP's convention: `<name>.png` (a PNG may keep its own name), where 0 = ignore.
 
+    Args: image: the name alone for a mask of any size.
     Returns: (H, W), True where matches are wanted; None when the image has no mask.
     Raises: InputError when the mask is broken or of another size than the image.
     """
-    path = mask_folder / f"{image.name}.png"
-    if not path.exists() and image.name.lower().endswith(".png"):
-        path = mask_folder / image.name
+    name = image if isinstance(image, str) else image.name
+    path = mask_folder / f"{name}.png"
+    if not path.exists() and name.lower().endswith(".png"):
+        path = mask_folder / name
     if not path.exists():
         return None
-    picture = _decode(_read(path, "mask"), str(path), max(image.width, image.height, MAX_IMAGE_SIZE))
+    largest = sys.maxsize if isinstance(image, str) else max(image.width, image.height, MAX_IMAGE_SIZE)
+    picture = _decode(_read(path, "mask"), str(path), largest)
     one_channel = picture.mode in ("1", "L", "I", "F") or picture.mode.startswith("I;16")
     mask = np.asarray(picture if one_channel else picture.convert("L")) != 0
-    if mask.shape != (image.height, image.width):
+    if isinstance(image, ImageFile) and mask.shape != (image.height, image.width):
         raise InputError(
             f"mask of '{image.name}' is {mask.shape[0]}x{mask.shape[1]} but the image is "
             f"{image.height}x{image.width} (height x width); make it again from this image"

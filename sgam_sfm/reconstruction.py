@@ -57,7 +57,8 @@ def aggregate(options: AggregateOptions, stages: Stages | None = None) -> dict[s
         run = starting_options(folder / "options.json", None)
         with stages.stage("Merging keypoints", None):
             records, limit = read_pairs_of(folder), run.geometry.max_residual
-            with merged_records(records, options.keypoints, limit, source.output, source.images) as merged:
+            folders = (source.output, source.images, run.mask_path)
+            with merged_records(records, options.keypoints, limit, *folders) as merged:
                 write_database(source.written, folder / "cameras.db", merged.keypoints, merged.matches)
                 write_for_hloc(merged, source.output, large=options.hloc)
                 content: dict[str, Any] = {"keypoints": summarise_keypoints(merged)}

@@ -36,7 +36,8 @@ class CollectionKeypoints:
     keypoints: image name -> (N, 2) pixels, float32, corner origin. matches: pair -> uint32 (M, 2) rows in the two
     images' keypoints, one-to-one. scores: pair -> float32 (M,) the best raw score of each. The raw matches are the
     exported ones, plus num_duplicates (fell together with an exported one), num_conflicts (would have put two spots of
-    an image into one track) and num_inconsistent (too far from the keypoints of their track).
+    an image into one track) and num_inconsistent (too far from the keypoints of their track, or one of these in masked
+    ground).
     """
 
     # Shapes are not in the types: what checks those would read from disk to do so.

@@ -9,7 +9,7 @@ A semi-dense matcher gives every pair points of its own, so its raw matches make
 3. `align_keypoints`: a joined keypoint lies between the points it was made of, so all keypoints move, by fractions of
    a matcher pixel, to where the matches of their track agree best; each match is carried to its keypoints along the
    local affine map of its pair.
-4. Matches that still disagree with their keypoints are dropped.
+4. Matches that still disagree with their keypoints, or have one in masked ground, are dropped.
 
 With the photos, step 3 is done once more: each match is measured again at its keypoints, by aligning the patches around
 them at full resolution.
@@ -55,6 +55,9 @@ _OCTAVE = 2.0  # points whose sigma is so many times the finest have no say in w
 
 Key = TypeVar("Key")
 
+Masks = Callable[[str], np.ndarray | None]
+"""Where an image (H, W) may have keypoints, True, by its name; None for anywhere. Threads may ask."""
+
 
 class OnDisk(Mapping[Key, np.ndarray]):
     """Arrays that are read when they are asked for."""
@@ -95,12 +98,17 @@ def merge_keypoints(
 
 @contextmanager
 def merging(
-    pairs: Iterable[RawPair], output: Path, options: KeypointOptions | None = None, photos: Photos | None = None
+    pairs: Iterable[RawPair],
+    output: Path,
+    options: KeypointOptions | None = None,
+    photos: Photos | None = None,
+    masks: Masks | None = None,
 ) -> Iterator[CollectionKeypoints]:
     """`merge_keypoints` for collections of any size: the arrays are read from disk when they are asked for.
 
     Args: output: gets a folder of up to about 130 bytes a match, which is removed at the end of the context.
-        photos: asked for when the options say `refine`.
+        photos: asked for when the options say `refine`. masks: matches are expected outside of masked ground, but their
+        keypoints, which move by some matcher pixels, need not be.
     """
     options = options or KeypointOptions()
     with Scratch(output / _FOLDER) as scratch:
@@ -118,6 +126,11 @@ def merging(
         if options.refine and photos is not None:
             measure_again(raw, tracks, photos, options.max_residual_sigmas)
             align(raw, tracks, scratch)
+        if masks is not None:
+            ends = pairwise(bounds.tolist())
+            for (begin, end), mask in zip(ends, in_order(masks, raw.names), strict=True):
+                if mask is not None:
+                    tracks.leave_out(begin, end, mask)
         merged = _export(raw, tracks, bounds, options.max_residual_sigmas, num_conflicts, scratch)
         del tracks
         _log.info(

@@ -112,11 +112,9 @@ def measure_again(raw: RawMatches, tracks: Tracks, photos: Photos, max_residual_
 
 
 def agreeing(tracks: Tracks, index: np.ndarray, rows: np.ndarray, max_residual_sigmas: float) -> np.ndarray:
-    """Which matches lie where their keypoints say."""
-    if max_residual_sigmas <= 0:
-        return np.ones(len(rows), bool)
+    """Which matches lie where their keypoints say; none whose keypoint lies nowhere."""
     error = np.linalg.norm(_offsets(tracks, index, rows), axis=1)
-    return error <= max_residual_sigmas * np.sqrt(np.abs(rows[:, VARIANCE]))
+    return error <= (max_residual_sigmas or np.inf) * np.sqrt(np.abs(rows[:, VARIANCE]))
 
 
 def _offsets(tracks: Tracks, index: np.ndarray, rows: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from sgam_sfm.merging.alignment import align_keypoints
 from sgam_sfm.merging.compiled import compiled
@@ -115,6 +115,17 @@ class Tracks:
         """
         points, sigmas, slots = self._values[:, _X : _Y + 1], self._values[:, _SIGMA], self._rows[:, _LINK]
         align_keypoints(points, sigmas, slots, index, tracks, offsets, affine, weights)
+
+    def leave_out(self, begin: int, end: int, mask: Bool[np.ndarray, "H W"]) -> None:
+        """Put the keypoints of an image that are not where its mask is True nowhere: no match agrees with them.
+
+        begin, end: the keypoints of the image. All are aligned.
+        """
+        points = self._values[begin:end, _X : _Y + 1]
+        x, y = np.floor(points).astype(np.int64).T
+        wanted = (x >= 0) & (x < mask.shape[1]) & (y >= 0) & (y < mask.shape[0])
+        wanted[wanted] = mask[y[wanted], x[wanted]]
+        points[~wanted] = np.nan
 
     def mark_used(self, keypoints: np.ndarray) -> None:
         """Mark keypoints as used, once all are aligned."""

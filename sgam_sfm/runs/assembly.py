@@ -9,7 +9,7 @@ import logging
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import cv2
@@ -20,7 +20,7 @@ from sgam_sfm.colmap.mapping import MappingOptions, MappingSummary, map_images
 from sgam_sfm.colmap.reading import read_camera_ids, read_counts, read_match_counts
 from sgam_sfm.colmap.verification import VerificationOptions, VerificationSummary, verify
 from sgam_sfm.hloc_files import matches_h5_size, write_keypoints_h5, write_matches_h5
-from sgam_sfm.images import read_image
+from sgam_sfm.images import read_image, read_mask
 from sgam_sfm.merging.keypoints import CollectionKeypoints, KeypointOptions
 from sgam_sfm.merging.merge import merging
 from sgam_sfm.merging.raw import RawPair
@@ -36,15 +36,22 @@ _PHOTOS_IN_MEMORY = 32  # of one byte a pixel
 
 @contextmanager
 def merged_records(
-    records: Iterable[PairRecord], options: KeypointOptions, max_residual: float, output: Path, images: Path
+    records: Iterable[PairRecord],
+    options: KeypointOptions,
+    max_residual: float,
+    output: Path,
+    images: Path,
+    masks: Path | None = None,
 ) -> Iterator[CollectionKeypoints]:
     """Keypoints from the raw matches of all pairs; their arrays can be read inside the context.
 
     Args: max_residual: of an inlier of its pair's geometry, see `GeometryOptions`. output: is given a folder for the
-        arrays, which is removed at the end. images: folder of the photos, read when keypoints are refined.
+        arrays, which is removed at the end. images: folder of the photos, read when keypoints are refined. masks: that
+        of their masks.
     """
     raw = (_raw_pair(record, max_residual) for record in records if record.result and len(record.result.matches))
-    with merging(raw, output, options, _photos(images)) as merged:
+    wanted = None if masks is None else partial(read_mask, masks)
+    with merging(raw, output, options, _photos(images), wanted) as merged:
         yield merged
 
 

@@ -132,8 +132,8 @@ def assemble(
     options, inputs, output = job.options, job.inputs, job.options.output
     with stages.stage("Merging keypoints", None):
         counted = CountedPairs(store.read_all(num_blocks))
-        limit = options.geometry.max_residual
-        with merged_records(counted, options.keypoints, limit, output, options.images) as merged:
+        limit, folders = options.geometry.max_residual, (output, options.images, options.mask_path)
+        with merged_records(counted, options.keypoints, limit, *folders) as merged:
             write = write_database if existing is None else append_to_database
             write(output / "database.db", output / "cameras.db", merged.keypoints, merged.matches)
             write_for_hloc(merged, output)

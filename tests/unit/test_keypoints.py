@@ -38,6 +38,24 @@ def test_three_images_with_exact_points_share_their_keypoints():
     assert (merged.num_raw, merged.num_duplicates, merged.num_conflicts, merged.num_inconsistent) == (6, 0, 0, 0)
 
 
+def test_a_match_is_dropped_whose_keypoint_lies_in_masked_ground(tmp_path):
+    raw = [(("a", "b"), matches(A, B), None), (("a", "c"), matches(A, C), None), (("b", "c"), matches(B, C), None)]
+    masks = {"a": np.ones((100, 50), bool), "b": None, "c": np.ones((90, 61), bool)}  # the second of c is at x = 61
+    masks["a"][10, 10] = False
+    for limit in (1.0, 0.0):
+        options = KeypointOptions(max_residual_sigmas=limit)
+        with merging(raw, tmp_path, options, masks=masks.get) as merged:
+            np.testing.assert_allclose(merged.keypoints["a"], A[1:], atol=1e-6)
+            np.testing.assert_allclose(merged.keypoints["b"], B, atol=1e-6)
+            np.testing.assert_allclose(merged.keypoints["c"], C[:1], atol=1e-6)
+            assert {pair: rows.tolist() for pair, rows in merged.matches.items()} == {
+                ("a", "b"): [[0, 1]],
+                ("a", "c"): [],
+                ("b", "c"): [[0, 0]],
+            }
+            assert (merged.num_matches, merged.num_inconsistent) == (2, 4)
+
+
 def test_a_cluster_is_the_mean_weighted_by_score_over_sigma_squared():
     keypoints, index = merge_image(
         np.array([[10.0, 10.0], [10.3, 10.0]]), np.array([1.0, 1.2]), np.array([0.5, 0.72]), radius_px=0.5
