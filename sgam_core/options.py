@@ -48,7 +48,7 @@ class CropOptions(_Checked):
     """Long side of an area's crop at the matcher, pixels. More is finer and slower."""
     image_size: int = 1024
     """Long side of a whole image at the matcher, pixels."""
-    max_crop_pixels: int = 4_000_000
+    max_crop_pixels: int = 2_200_000
     """Area-crop pixels matched per pair, both sides together; areas beyond it are skipped and counted (0: no limit)."""
     expand: float = 1.2
     """Side of the crop over the long side of its area."""

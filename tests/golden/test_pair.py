@@ -54,17 +54,20 @@ def errors_px(scene: Path, names: tuple[str, str], result) -> np.ndarray:
     return np.sqrt(sampson_distance(true_f(scene, names), result.matches.points0, result.matches.points1))
 
 
-def test_areas_match_more_points_more_precisely_than_whole_images(scene, tmp_path):
+@pytest.mark.parametrize(("max_crop_pixels", "least_areas"), [(None, 2), (4_000_000, 3)])
+def test_areas_match_more_points_more_precisely_than_whole_images(scene, tmp_path, max_crop_pixels, least_areas):
     images = read(scene, NEAR)
     files = [inspect_image(scene / "images", name) for name in NEAR]
     labels = {file.name: found for file, found in CoSeg(cache_folder=tmp_path).segment(files, lambda _: None)}
     matcher, options, areas = XFeatStar(), SGAMOptions(), SemanticAreaMatcher()
+    if max_crop_pixels:
+        options = changed(options, crop__max_crop_pixels=max_crop_pixels)
     described = [areas.describe(image, labels[image.name]) for image in images]
     by_areas = match_described(*images, *described, areas, matcher, options)
     plain = match_described(*images, None, None, WholeImages(), matcher, options)
 
     assert by_areas.fallback == ""
-    assert sum(area.state is AreaState.KEPT for area in by_areas.areas) >= 3
+    assert sum(area.state is AreaState.KEPT for area in by_areas.areas) >= least_areas
     assert by_areas.two_view is not None
     assert by_areas.two_view.inlier_ratio > 0.8
     fine, coarse = (errors_px(scene, NEAR, result) for result in (by_areas, plain))

@@ -35,7 +35,7 @@ def arguments(folder: Path, output: Path, *more: str) -> list[str]:
     return [
         *("match", "--images", str(folder / "images"), "--pairs", str(folder / "pairs.txt")),
         *("--cameras", str(folder / "cameras.txt"), "--labels", str(folder / "labels")),
-        *("--output", str(output), "--block-images", "2", "--max-crop-pixels", "1000000"),
+        *("--output", str(output), "--block-images", "2", "--max-crop-pixels", "600000"),
         *("--image-size", "400", *more),
     ]
 
