@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from sgam_core import AreaMatcher, Box, Image, Matches, TileAreaMatcher, match_described
 from sgam_core.errors import OptionError
-from sgam_core.options import CropOptions, SGAMOptions, TileOptions
+from sgam_core.options import CropOptions, SGAMOptions, TileOptions, changed
 from sgam_core.tiles import grid
 from tests.two_views import HEIGHT, WIDTH, two_views
 
@@ -150,7 +150,8 @@ def run(matches: Matches):
     matcher, points = TileAreaMatcher(), Fixed(matches)
     images = blank("a", WIDTH, HEIGHT), blank("b", WIDTH, HEIGHT)
     described = [matcher.describe(image, None) for image in images]
-    return match_described(*images, *described, matcher, points, SGAMOptions()), points
+    options = changed(SGAMOptions(), crop__max_crop_pixels=4_000_000)  # for all tiles
+    return match_described(*images, *described, matcher, points, options), points
 
 
 def test_tiles_go_through_all_stages_and_the_matcher_sees_the_tiles_themselves():
