@@ -165,29 +165,34 @@ def read_image(file: ImageFile | Path, max_size: int = MAX_IMAGE_SIZE) -> UInt8[
     return _rgb(_decode(_read(file, "image"), file.name, max_size), file.name)
 
 
-def read_mask(mask_folder: Path, image: ImageFile | str) -> Bool[np.ndarray, "H W"] | None:
-    """The mask of an image by COLMAP's convention: `<name>.png` (a PNG may keep its own name), where 0 = ignore.
+def read_mask(mask_folder: Path, image: ImageFile) -> Bool[np.ndarray, "H W"] | None:
+    """The mask of an image, see `read_mask_of_any_size`.
 
-    Args: image: the name alone for a mask of any size.
-    Returns: (H, W), True where matches are wanted; None when the image has no mask.
     Raises: InputError when the mask is broken or of another size than the image.
     """
-    name = image if isinstance(image, str) else image.name
-    path = mask_folder / f"{name}.png"
-    if not path.exists() and name.lower().endswith(".png"):
-        path = mask_folder / name
-    if not path.exists():
-        return None
-    largest = sys.maxsize if isinstance(image, str) else max(image.width, image.height, MAX_IMAGE_SIZE)
-    picture = _decode(_read(path, "mask"), str(path), largest)
-    one_channel = picture.mode in ("1", "L", "I", "F") or picture.mode.startswith("I;16")
-    mask = np.asarray(picture if one_channel else picture.convert("L")) != 0
-    if isinstance(image, ImageFile) and mask.shape != (image.height, image.width):
+    mask = read_mask_of_any_size(mask_folder, image.name, max(image.width, image.height, MAX_IMAGE_SIZE))
+    if mask is not None and mask.shape != (image.height, image.width):
         raise InputError(
             f"mask of '{image.name}' is {mask.shape[0]}x{mask.shape[1]} but the image is "
             f"{image.height}x{image.width} (height x width); make it again from this image"
         )
     return mask
+
+
+def read_mask_of_any_size(mask_folder: Path, name: str, max_size: int = sys.maxsize) -> Bool[np.ndarray, "H W"] | None:
+    """The mask of an image by COLMAP's convention: `<name>.png` (a PNG may keep its own name), where 0 = ignore.
+
+    Returns: (H, W), True where matches are wanted; None when the image has no mask.
+    Raises: InputError when the mask is broken, or has a side of more than `max_size` pixels.
+    """
+    path = mask_folder / f"{name}.png"
+    if not path.exists() and name.lower().endswith(".png"):
+        path = mask_folder / name
+    if not path.exists():
+        return None
+    picture = _decode(_read(path, "mask"), str(path), max_size)
+    one_channel = picture.mode in ("1", "L", "I", "F") or picture.mode.startswith("I;16")
+    return np.asarray(picture if one_channel else picture.convert("L")) != 0
 
 
 def read_label_map(path: Path, max_size: int = MAX_IMAGE_SIZE) -> Int32[np.ndarray, "H W"]:

@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sgam_core.types import Box
 from sgam_sfm.merging.alignment import align_keypoints
 from sgam_sfm.merging.compiled import compiled
 from sgam_sfm.merging.grid import cells_around, grid_of
@@ -122,9 +123,9 @@ class Tracks:
         begin, end: the keypoints of the image. All are aligned.
         """
         points = self._values[begin:end, _X : _Y + 1]
-        x, y = np.floor(points).astype(np.int64).T
-        wanted = (x >= 0) & (x < mask.shape[1]) & (y >= 0) & (y < mask.shape[0])
-        wanted[wanted] = mask[y[wanted], x[wanted]]
+        wanted = Box(x0=0, y0=0, x1=mask.shape[1], y1=mask.shape[0]).contains(points)
+        x, y = points[wanted].astype(int).T
+        wanted[wanted] = mask[y, x]
         points[~wanted] = np.nan
 
     def mark_used(self, keypoints: np.ndarray) -> None:

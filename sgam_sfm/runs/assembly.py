@@ -20,7 +20,7 @@ from sgam_sfm.colmap.mapping import MappingOptions, MappingSummary, map_images
 from sgam_sfm.colmap.reading import read_camera_ids, read_counts, read_match_counts
 from sgam_sfm.colmap.verification import VerificationOptions, VerificationSummary, verify
 from sgam_sfm.hloc_files import matches_h5_size, write_keypoints_h5, write_matches_h5
-from sgam_sfm.images import read_image, read_mask
+from sgam_sfm.images import read_image, read_mask_of_any_size
 from sgam_sfm.merging.keypoints import CollectionKeypoints, KeypointOptions
 from sgam_sfm.merging.merge import merging
 from sgam_sfm.merging.raw import RawPair
@@ -50,7 +50,7 @@ def merged_records(
         of their masks.
     """
     raw = (_raw_pair(record, max_residual) for record in records if record.result and len(record.result.matches))
-    wanted = None if masks is None else partial(read_mask, masks)
+    wanted = None if masks is None else partial(read_mask_of_any_size, masks)
     with merging(raw, output, options, _photos(images), wanted) as merged:
         yield merged
 

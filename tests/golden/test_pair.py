@@ -54,14 +54,14 @@ def errors_px(scene: Path, names: tuple[str, str], result) -> np.ndarray:
     return np.sqrt(sampson_distance(true_f(scene, names), result.matches.points0, result.matches.points1))
 
 
-@pytest.mark.parametrize(("max_crop_pixels", "least_areas"), [(None, 2), (4_000_000, 3)])
-def test_areas_match_more_points_more_precisely_than_whole_images(scene, tmp_path, max_crop_pixels, least_areas):
+@pytest.mark.parametrize(
+    ("options", "least_areas"), [(SGAMOptions(), 2), (changed(SGAMOptions(), crop__max_crop_pixels=4_000_000), 3)]
+)
+def test_areas_match_more_points_more_precisely_than_whole_images(scene, tmp_path, options, least_areas):
     images = read(scene, NEAR)
     files = [inspect_image(scene / "images", name) for name in NEAR]
     labels = {file.name: found for file, found in CoSeg(cache_folder=tmp_path).segment(files, lambda _: None)}
-    matcher, options, areas = XFeatStar(), SGAMOptions(), SemanticAreaMatcher()
-    if max_crop_pixels:
-        options = changed(options, crop__max_crop_pixels=max_crop_pixels)
+    matcher, areas = XFeatStar(), SemanticAreaMatcher()
     described = [areas.describe(image, labels[image.name]) for image in images]
     by_areas = match_described(*images, *described, areas, matcher, options)
     plain = match_described(*images, None, None, WholeImages(), matcher, options)
