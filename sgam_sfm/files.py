@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from threading import get_native_id
 from typing import Any
@@ -39,9 +41,26 @@ def remove_partials(output: Path) -> None:
     """Remove what a process that was killed left half-written in a run's folder; nobody else may be writing there."""
     folders = [output, *(output / name for name in ("pairs", "labels", "cache"))]
     for folder in folders:
-        for path in folder.glob(".*.partial*") if folder == output else folder.rglob(".*.partial*"):
+        for path in list(folder.glob(".*.partial*") if folder == output else folder.rglob(".*.partial*")):
             if _PARTIAL.fullmatch(path.name):
-                path.unlink(missing_ok=True)
+                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def content_digest(path: Path) -> str:
+    """The SHA-256 of a file, or of the names and the content of all maps (`.png`, `.json`) in a folder."""
+    if not path.is_dir():
+        return _file_digest(path, path.stat().st_mtime_ns)
+    digest = hashlib.sha256()
+    for file in sorted(file for file in path.rglob("*") if file.suffix.lower() in (".png", ".json")):
+        digest.update(f"{file.relative_to(path)} {_file_digest(file, file.stat().st_mtime_ns)}\n".encode())
+    return digest.hexdigest()
+
+
+@cache
+def _file_digest(path: Path, changed: int) -> str:
+    """Args: changed: when the file was; a digest is asked for whenever options are written."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def flush(path: Path) -> None:

@@ -155,7 +155,7 @@ def read_run_record(output: Path) -> RunRecord | None:
     try:
         with lock:
             return replace(record, state="killed", eta_seconds=None, error="it ended without a word: killed?")
-    except Timeout:
+    except (Timeout, OSError):  # it runs, or nobody else may tell
         return record
 
 

@@ -131,11 +131,22 @@ def test_durations_for_people(seconds, told):
 
 
 def test_what_a_killed_process_left_half_written_is_removed(tmp_path):
-    ours = [".database.db.12.partial", ".cameras.db.345.partial-wal", "pairs/.00001.h5.7.partial"]
+    ours = [".database.db.12.partial", ".cameras.db.345.partial-wal", "pairs/.00001.h5.7.partial", ".sparse.8.partial"]
     others = ["pairs/00001.h5", ".hidden.partial", "sub/.a.txt.12.partial"]
     for name in (*ours, *others):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
+    (tmp_path / ours[-1]).unlink()
+    (tmp_path / ours[-1] / "0").mkdir(parents=True)  # of a mapper
     with recording(tmp_path, Stages(quiet=True)):
         pass
-    assert [(tmp_path / name).exists() for name in (*ours, *others)] == [False] * 3 + [True] * 3
+    assert [(tmp_path / name).exists() for name in (*ours, *others)] == [False] * 4 + [True] * 3
+
+
+def test_the_state_of_a_run_in_a_folder_of_somebody_else(tmp_path, monkeypatch):
+    def refuse(*_args, **_options):
+        raise PermissionError(".lock")
+
+    with recording(tmp_path, stages := Stages(quiet=True)), stages.stage("Matching pairs", 10):
+        monkeypatch.setattr(run_record.FileLock, "acquire", refuse)
+        assert read_run_record(tmp_path).state == "running"
