@@ -75,6 +75,8 @@ def match_described(
     those taken from near are made smaller, and guided areas follow. Crops are those of `area_crop`, unless it has a
     method `crop(image, box, options)` of its own.
     """
+    sizes = ((image.width, image.height) for image in (image0, image1))
+    options = replace(options, crop=options.crop.of_shapes(*sizes))
     points = PairPoints(image0, image1, point_matcher, options.crop, getattr(area_matcher, "crop", area_crop))
     estimate = partial(
         estimate_two_view, camera0=image0.camera_matrix, camera1=image1.camera_matrix, options=options.geometry

@@ -6,6 +6,7 @@ distances divided by sigma^2, sigma being image pixels per matcher pixel on the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 DESCRIPTOR_SCALES = (0.8, 1.2, 1.4)  # both descriptors look at these multiples of an area (paper, appendix)
+_PHOTO = 3 / 2  # long side over short side
 
 
 class _Checked:
@@ -49,7 +51,8 @@ class CropOptions(_Checked):
     image_size: int = 1024
     """Long side of a whole image at the matcher, pixels."""
     max_crop_pixels: int = 2_200_000
-    """Area-crop pixels matched per pair, both sides together; areas beyond it are skipped and counted (0: no limit)."""
+    """Area-crop pixels matched per pair of 3:2 photos, both sides together, and in proportion to their whole images for
+    those of other shapes; areas beyond it are skipped and counted (0: no limit)."""
     expand: float = 1.2
     """Side of the crop over the long side of its area."""
     keep: float = 1.1
@@ -63,6 +66,14 @@ class CropOptions(_Checked):
     def __post_init__(self) -> None:
         _Checked.__post_init__(self)
         self._is_upsampling("max_upsampling", "max_whole_upsampling")
+
+    def of_shapes(self, *sizes: tuple[int, int]) -> CropOptions:
+        """The same with `max_crop_pixels` for a pair of images of these sizes (width, height).
+
+        Whole images are matched at one long side, so squarer ones have more pixels, and so must crops, to be finer.
+        """
+        share = sum(min(size) / max(size) for size in sizes) / len(sizes)
+        return replace(self, max_crop_pixels=math.ceil(self.max_crop_pixels * (share * _PHOTO)))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -22,12 +22,12 @@ FRAME = Frame(name="a", width=3000, height=2000, camera_matrix=None)
 CROP = CropOptions(area_size=640, max_crop_pixels=4_000_000)
 
 
-def zoomed(factor: float, shift: float = 0.0, *, sigma: float = 3.0, count: int = 900) -> Matches:
+def zoomed(factor: float, shift: float = 0.0, *, sigma: float = 3.0, count: int = 900, frame: Frame = FRAME) -> Matches:
     """Matches all over what two images share, the second `factor` times as large about the middle, and shifted."""
-    points0 = np.random.default_rng(0).uniform(0, (FRAME.width, FRAME.height), (count, 2))
-    middle = np.array([FRAME.width / 2, FRAME.height / 2])
+    points0 = np.random.default_rng(0).uniform(0, (frame.width, frame.height), (count, 2))
+    middle = np.array([frame.width / 2, frame.height / 2])
     points1 = (points0 - middle) * factor + middle + (shift, 0)
-    inside = ((points1 >= 0) & (points1 < (FRAME.width, FRAME.height))).all(axis=1)
+    inside = ((points1 >= 0) & (points1 < (frame.width, frame.height))).all(axis=1)
     points0, points1 = points0[inside], points1[inside]
     sigmas = np.full(len(points0), sigma)
     return Matches(points0=points0, points1=points1, scores=np.ones(len(points0)), sigmas0=sigmas, sigmas1=sigmas)
@@ -85,6 +85,16 @@ def test_photos_are_enlarged_to_be_twice_as_fine_as_the_first_round_saw_them(ima
     crop = CropOptions(area_size=8000, image_size=image_size, max_crop_pixels=0)
     areas = guided_areas(zoomed(1), FRAME, FRAME, crop, GuidanceOptions())
     assert max(area.scale0 for area in areas) == pytest.approx(finest)
+
+
+@pytest.mark.parametrize("height", [1500, 2000, 2250, 3000])
+def test_photos_of_every_shape_are_seen_more_finely(height):
+    frame = replace(FRAME, height=height)
+    crop = CropOptions().of_shapes((frame.width, frame.height), (frame.width, frame.height))
+    sigma = frame.width / crop.image_size
+    areas = guided_areas(zoomed(1, frame.width / 5, sigma=sigma, frame=frame), frame, frame, crop, GuidanceOptions())
+    assert areas
+    assert min(area.scale0 for area in areas) * sigma > 1.15
 
 
 def test_without_limits_every_crop_is_as_large_as_may_be():
