@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -57,7 +58,16 @@ def match_pair(
         area_matcher.describe(first, np.asarray(labels0, np.int32)),
         area_matcher.describe(second, np.asarray(labels1, np.int32)),
     )
-    return match_described(first, second, *described, area_matcher, point_matcher, options)
+    return match_described(_by_content(first), _by_content(second), *described, area_matcher, point_matcher, options)
+
+
+def _by_content(image: Image) -> Image:
+    """An image whose name is that of no other, since point matchers keep features by name from pair to pair."""
+    digest = hashlib.blake2b(repr(image.pixels.shape).encode(), digest_size=16)
+    for array in (image.pixels, image.mask):
+        if array is not None:
+            digest.update(np.ascontiguousarray(array).data)
+    return replace(image, name=digest.hexdigest())
 
 
 def match_described(

@@ -111,6 +111,7 @@ class CollectionMatcher:
         self.image = ReadAhead(self._read_image, 2 * options.block_images)  # those of one block
         self._description = lru_cache(_DESCRIPTIONS_IN_MEMORY)(self._describe)
         self._faults, self._any_result = 0, False
+        reset(point_matcher)  # what it keeps goes by image names, which were another collection's
 
     def match_blocks(
         self, blocks: Sequence[tuple[int, Sequence[Pair]]], begin: Callable[[Pair], None], *, alone: int = 0

@@ -11,9 +11,10 @@ from threading import Lock
 import numpy as np
 import pytest
 
-from sgam_core import Crop
+from sgam_core import Crop, match_pair
 from sgam_sfm.matchers.feature_cache import FeatureCache
-from tests.textures import whole
+from sgam_sfm.matchers.sift import sift
+from tests.textures import similarity, view, whole
 
 THREADS = 8
 
@@ -96,3 +97,12 @@ def test_what_cannot_be_extracted_is_told_to_all_who_wait_and_tried_again(crops)
     by_threads(work)
     extract.failing = ()
     assert [cache.of(crop).of for crop in crops] == [crop.key for crop in crops]
+
+
+def test_a_matcher_that_is_used_again_takes_no_image_for_one_before():
+    matcher, labels = sift(), np.zeros((240, 320), np.int32)
+    for seed, shift in ((1, 20), (2, 45)):
+        image = view(np.eye(3), (320, 240), seed)
+        moved = view(similarity(1.0, 0.0, (shift, 0.0), (0.0, 0.0)), (320, 240), seed)
+        matches = match_pair(image, moved, labels, labels, matcher).matches
+        assert np.median(matches.points1 - matches.points0, axis=0) == pytest.approx([shift, 0], abs=0.1)
