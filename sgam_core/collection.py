@@ -40,7 +40,7 @@ def collect(
 
     Args: inside, the matches of every kept area; model, their geometry.
     """
-    if options.rule == "none" or smaller_coverage >= options.min_coverage or model is None:
+    if options.rule == "none" or smaller_coverage >= options.min_coverage or model is None or not any(map(len, inside)):
         return Matches.empty()
     found = [residuals(model.F, matches) for matches in inside if len(matches)]
     if options.rule == "paper":

@@ -129,7 +129,7 @@ def _enumerate(
 
     best = min(_matchings(group), key=lambda rows: (total(rows), rows))
     cost = {(c.area.area0, c.area.area1): float(cross[[*best, k]][:, k].mean()) for k, c in enumerate(group)}
-    chosen = {(group[k].area.area0, group[k].area.area1) for k in best if len(best) > 1 or cross[k, k] < dummy}
+    chosen = {(group[k].area.area0, group[k].area.area1) for k in best}
     return [_judge(candidate, chosen, cost, options) for candidate in group]
 
 

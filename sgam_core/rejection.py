@@ -13,6 +13,8 @@ from sgam_core.prediction import Estimate, MatchedArea
 from sgam_core.types import AreaState, Matches, TwoViewModel
 from sgam_core.wording import counted
 
+_NO_GEOMETRY = "no geometry: the areas' matches give none"
+
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Verdict:
@@ -55,6 +57,7 @@ def reject(
     if not fallback:
         pool = _pool(kept, options.max_pooled)
         model = estimate(Matches.concatenate([pool, _best(whole, len(pool))])) or model
+        fallback = "" if model is not None else _NO_GEOMETRY
     areas = tuple(_counted(area, model, geometry) for area in judged_all)
     return Verdict(areas=areas, model=model, fallback=fallback)
 
@@ -86,7 +89,7 @@ def _consensus(
     else:
         model = estimate(Matches.concatenate([pool, _best(whole, len(pool))]))
     if model is None:
-        return list(candidates), None, "no geometry: the areas' matches give none"
+        return list(candidates), None, _NO_GEOMETRY
     ratio = float((residuals(model.F, pool) <= geometry.max_residual).mean()) if len(pool) else 0.0
     if ratio < options.min_pool_inlier_ratio and not single:
         agree = f"{ratio:.2f} of their matches fit one geometry, below {options.min_pool_inlier_ratio:.2f}"

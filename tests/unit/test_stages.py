@@ -202,6 +202,12 @@ def test_gr_without_areas_says_so():
     assert judge([skipped]).fallback == "every area match was skipped"
 
 
+@pytest.mark.parametrize("rule", ["paper", "none"])
+def test_gr_falls_back_where_areas_have_too_few_matches_for_a_geometry(rule):
+    verdict = judge([true_area(WINDOWS[0], 1, count=3)], rule)
+    assert (verdict.model, verdict.fallback) == (None, "no geometry: the areas' matches give none")
+
+
 def test_gr_can_be_turned_off():
     verdict = judge([wrong_area(WINDOWS[0], WINDOWS[3], 1), true_area(WINDOWS[1], 2)], "none")
     assert states(verdict.areas) == ["kept", "kept"]
@@ -224,6 +230,7 @@ def test_gmc_collects_consistent_whole_image_matches_only_where_areas_cover_litt
     assert 250 < len(found) < 330
     assert len(collect([inside], 0.5, model, lambda: whole, CollectionOptions(min_coverage=0.3))) == 0
     assert len(collect([inside], 0.1, None, lambda: whole, CollectionOptions(min_coverage=0.3))) == 0
+    assert len(collect([Matches.empty()], 0.1, model, lambda: whole, CollectionOptions(min_coverage=0.3))) == 0
     literal = collect([inside], 0.1, model, lambda: whole, CollectionOptions(rule="paper-literal", min_coverage=0.3))
     paper = collect([inside], 0.1, model, lambda: whole, CollectionOptions(rule="paper", min_coverage=0.3))
     assert len(paper) < len(found) < len(literal)
