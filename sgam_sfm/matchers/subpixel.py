@@ -6,6 +6,7 @@ Rough matches already tell how the surroundings map, so each patch is compared t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -25,6 +26,7 @@ OUTLYING = 0.1  # this far off the local map (in radii of the neighbourhood) a n
 PRIOR = 1e-3  # towards the identity, for neighbours on a line
 MIN_CORRELATION = 0.6  # of two patches that may move a match
 MAX_SHIFT = 2.0  # crop pixels; a larger one has slid along an edge
+_PATCHES_AT_ONCE = 2**13  # 15 MB each time that they are sampled; OpenCV takes less than 2**15
 
 _span = np.arange(-RADIUS, RADIUS + 1, dtype=np.float32)
 _GRID = np.stack(np.meshgrid(_span, _span), -1).reshape(-1, 2)
@@ -71,16 +73,27 @@ def refine(
 ) -> tuple[Float[np.ndarray, "M 2"], Float[np.ndarray, " M"]]:
     """Move points1 to where image 1 looks most like image 0 around points0, whatever the brightness and contrast.
 
+    Patches are made and compared some thousands at a time, which bounds the memory that they take.
+
     Args: gray0, gray1 intensities; points in pixels, corner origin; affines: the linear maps from image 0 to image 1;
         strides: pixels between the samples of a patch, coarse to fine. A stride reaches about three times as far.
     Returns: the new points1, and the correlation of each pair of patches in [-1, 1], 0 where there is no texture.
     Source: inverse compositional alignment (Baker & Matthews, IJCV 2004) of a translation, the affine part held.
     """
+    moved, correlation = points1.copy(), np.zeros(len(points0))
+    smooth = [(stride, _smoothed(gray0, stride), _smoothed(gray1, stride)) for stride in strides]
+    for begin in range(0, len(points0), _PATCHES_AT_ONCE):
+        here = slice(begin, begin + _PATCHES_AT_ONCE)
+        moved[here], correlation[here] = _aligned_patches(smooth, points0[here], points1[here], affines[here])
+    return moved, correlation
+
+
+def _aligned_patches(
+    smooth: Sequence[tuple[int, np.ndarray, np.ndarray]], points0: np.ndarray, points1: np.ndarray, affines: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Args: smooth: a stride, and both images as they are sampled with it."""
     correlation = np.zeros(len(points0))
-    if len(points0) == 0:
-        return points1, correlation
-    for stride in strides:
-        smooth0, smooth1 = _smoothed(gray0, stride), _smoothed(gray1, stride)
+    for stride, smooth0, smooth1 in smooth:
         template, contrast0 = _patches(smooth0, points0, stride * _GRID)
         slopes = np.gradient(template.reshape(-1, SIDE, SIDE), stride, axis=(2, 1))
         slope_x, slope_y = (slope.reshape(len(points0), -1) for slope in slopes)

@@ -24,7 +24,6 @@ from sgam_sfm.merging.scratch import Scratch
 from sgam_sfm.merging.tracks import Tracks
 from sgam_sfm.threads import in_order
 
-_PATCHES_AT_ONCE = 2**13
 _LARGEST_MOVE = 2.0  # matcher pixels: what moves further has slid along an edge
 _SURE_CORRELATION = 0.85  # of two patches whose alignment counts
 _MEASURED_VARIANCE = 0.05  # of a match that was measured again, against what it was before
@@ -90,21 +89,19 @@ def measure_again(raw: RawMatches, tracks: Tracks, photos: Photos, max_residual_
         agree = agreeing(tracks, index, part, max_residual_sigmas)
         kept, part = kept[agree], part[agree]
         points = tracks.points(index[agree].ravel()).reshape(-1, 2, 2)
-        affine = local_affine(points[:, 0], points[:, 1], part[:, VARIANCE] > 0)
+        points0, points1 = points[:, 0], points[:, 1]
+        affine = local_affine(points0, points1, part[:, VARIANCE] > 0)
         coarsest = 2 ** int(np.ceil(np.log2(max(float(np.median(part[:, SIGMAS])), 1.0)))) if len(part) else 1
         strides = tuple(stride for stride in (8, 4, 2, 1) if stride <= coarsest)
         gray0, gray1 = (photos(name).astype(np.float32) for name in sorted(pair.pair))
-        for begin in range(0, len(part), _PATCHES_AT_ONCE):
-            here = slice(begin, begin + _PATCHES_AT_ONCE)
-            points0, points1 = points[here, 0], points[here, 1]
-            found, correlation = refine(gray0, gray1, points0, points1, affine[here], strides=strides)
-            near = np.linalg.norm(found - points1, axis=1) <= _LARGEST_MOVE * part[here, SIGMAS][:, 1]
-            sure = near & (correlation > _SURE_CORRELATION)
-            changed = part[here][sure]
-            changed[:, POINTS] = np.column_stack([points0, found])[sure]
-            changed[:, AFFINE] = affine[here][sure].reshape(-1, 4)
-            changed[:, VARIANCE] *= _MEASURED_VARIANCE
-            rows[kept[here][sure]] = changed
+        found, correlation = refine(gray0, gray1, points0, points1, affine, strides=strides)
+        near = np.linalg.norm(found - points1, axis=1) <= _LARGEST_MOVE * part[:, SIGMAS][:, 1]
+        sure = near & (correlation > _SURE_CORRELATION)
+        changed = part[sure]
+        changed[:, POINTS] = np.column_stack([points0, found])[sure]
+        changed[:, AFFINE] = affine[sure].reshape(-1, 4)
+        changed[:, VARIANCE] *= _MEASURED_VARIANCE
+        rows[kept[sure]] = changed
         raw.rows.write(pair.begin, rows)
 
     for _ in in_order(of_pair, (pair for pair in raw.pairs if pair.length)):

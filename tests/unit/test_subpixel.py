@@ -56,6 +56,15 @@ def test_refine_recovers_a_warp_to_a_twentieth_of_a_pixel(scale, degrees):
     assert np.median(correlation) > 0.99
 
 
+def test_more_points_than_opencv_takes_at_once_are_refined_as_few_are():
+    gray = view(np.eye(3), (320, 240))[..., 0].astype(np.float32)
+    points = np.tile(np.random.default_rng(0).uniform([90, 60], [230, 180], (50, 2)), (700, 1))
+    affines = np.tile(np.eye(2), (len(points), 1, 1))
+    few, many = (refine(gray, gray, points[:n], points[:n] + 0.4, affines[:n], strides=(1,)) for n in (50, 35_000))
+    np.testing.assert_allclose(many[0], np.tile(few[0], (700, 1)), atol=1e-6)
+    np.testing.assert_allclose(many[1], np.tile(few[1], 700), atol=1e-6)
+
+
 def test_a_patch_without_texture_correlates_with_nothing():
     flat = np.full((50, 60), 7, np.float32)
     point = np.array([[30.0, 25.0]])
