@@ -43,9 +43,12 @@ def match_blocks(
         if number in retried:
             waiting.append((number, failed[number]))
         elif number not in kept:
-            opened[number] = store.begun(number, work[number])
-            _count(stages, opened[number])
-            waiting.append((number, work[number][len(opened[number]) :]))
+            opened[number] = begun = store.begun(number, work[number])
+            _count(stages, begun)
+            if len(begun) == len(work[number]):  # stopped while it was written
+                store.write(number, opened.pop(number))
+            else:
+                waiting.append((number, work[number][len(begun) :]))
     num_pairs = sum(len(work[number]) for number in wanted)
     seconds: dict[str, float] = {}
 
@@ -61,7 +64,8 @@ def match_blocks(
                 records += found
                 if len(records) == len(failed[number] if number in retried else work[number]):
                     write = store.replace if number in retried else store.write
-                    write(number, opened.pop(number))
+                    write(number, records)
+                    del opened[number]  # not before: a stop while it is written keeps it
                     saved = time.monotonic()
                 elif time.monotonic() - saved > _MOST_LOST_SECONDS:
                     keep(number)

@@ -89,6 +89,20 @@ def test_a_run_that_is_stopped_goes_on_with_the_next_pair(tmp_path, undisturbed,
     assert content(tmp_path) == undisturbed
 
 
+def test_a_stop_while_a_block_is_written_costs_nothing_of_it(tmp_path, undisturbed, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(PairStore, "write", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            matched(tmp_path, PairByPair())
+    rest = PairByPair()
+    matched(tmp_path, rest)
+    assert rest.asked == list(WORK[1])
+    assert content(tmp_path) == undisturbed
+
+
 def test_what_is_done_of_a_block_is_kept_while_it_lasts(tmp_path, undisturbed, monkeypatch):
     monkeypatch.setattr(block_matching, "_MOST_LOST_SECONDS", -1.0)
     store = PairStore(folder=tmp_path / "pairs", fingerprint="mark")
