@@ -58,11 +58,16 @@ _MAX_REFERENCES = 60
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class _Query:
-    """What became of a photo. reason: why it has no pose, empty when it has one."""
+    """What became of a photo.
+
+    correspondences: how many there were. seen: of those that agree with the pose, one for each point. reason: why it
+    has no pose, empty when it has one.
+    """
 
     references: int
     matches: int
-    found: Correspondences
+    correspondences: int
+    seen: Correspondences
     pose: Pose | None
     reason: str
 
@@ -281,7 +286,23 @@ def _locate(info: CameraInfo, records: list[PairRecord], found: Correspondences,
         reason = f"{tried} show {counted(points, 'point')} of the model; {needed}"
     elif agree < options.min_inliers:
         reason = f"{agree} of {counted(points, 'point')} of the model agree with one pose; {needed}"
-    return _Query(references=len(records), matches=matches, found=found, pose=None if reason else pose, reason=reason)
+    pose = None if reason else pose
+    return _Query(
+        references=len(records),
+        matches=matches,
+        correspondences=len(found.ids),
+        seen=joined([]) if pose is None else found.select(_one_for_each_point(found, pose)),
+        pose=pose,
+        reason=reason,
+    )
+
+
+def _one_for_each_point(found: Correspondences, pose: Pose) -> np.ndarray:
+    """Rows of the correspondences that agree with the pose."""
+    inliers = np.flatnonzero(pose.inliers)
+    _, first = np.unique(found.ids[inliers], return_index=True)
+    rows: np.ndarray = inliers[first]
+    return rows
 
 
 def _told(query: _Query) -> dict[str, Any]:
@@ -289,7 +310,7 @@ def _told(query: _Query) -> dict[str, Any]:
     return {
         "references": query.references,
         "matches": query.matches,
-        "correspondences": len(query.found.ids),
+        "correspondences": query.correspondences,
         "inliers": 0 if pose is None else int(pose.inliers.sum()),
         "points": 0 if pose is None else pose.num_points,
         "camera": None if pose is None else {"model": pose.camera.model_name, "params": pose.camera.params.tolist()},
@@ -335,13 +356,10 @@ def _write_model(
             camera.camera_id = camera_ids[info.camera_id] = next_camera
             model.add_camera_with_trivial_rig(camera)
             next_camera += 1
-        inliers = np.flatnonzero(pose.inliers)
-        _, first = np.unique(query.found.ids[inliers], return_index=True)
-        rows = inliers[first]
-        image = pycolmap.Image(name, query.found.pixels[rows], camera_ids[info.camera_id], next_image)
+        image = pycolmap.Image(name, query.seen.pixels, camera_ids[info.camera_id], next_image)
         model.add_image_with_trivial_frame(image, pose.cam_from_world)
-        for column, row in enumerate(rows):
-            model.add_observation(int(query.found.ids[row]), pycolmap.TrackElement(next_image, column))
+        for column, point in enumerate(query.seen.ids.tolist()):
+            model.add_observation(point, pycolmap.TrackElement(next_image, column))
         next_image += 1
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)

@@ -37,6 +37,10 @@ class Correspondences:
     points_in_world: Float[np.ndarray, "N 3"]
     ids: Int[np.ndarray, " N"]
 
+    def select(self, rows: Int[np.ndarray, " K"]) -> Correspondences:
+        """Some of them."""
+        return Correspondences(pixels=self.pixels[rows], points_in_world=self.points_in_world[rows], ids=self.ids[rows])
+
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Pose:

@@ -110,7 +110,8 @@ def _numbered_cameras(path: Path, cameras: Mapping[str, KnownCamera]) -> dict[st
         )
     named = {}
     lines = [line for line in images.read_text(encoding="utf-8-sig").splitlines() if not line.startswith("#")]
-    for line in filter(str.strip, lines[::2]):  # a line of points, which may be empty, follows each
+    first = next((row for row, line in enumerate(lines) if line.strip()), 0)
+    for line in filter(str.strip, lines[first::2]):  # a line of points, which may be empty, follows each
         fields = line.split(maxsplit=9)
         if len(fields) != 10 or fields[8] not in cameras:
             raise InputError(

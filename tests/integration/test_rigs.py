@@ -124,7 +124,7 @@ def test_one_camera_of_colmaps_list_is_that_of_all_images(tmp_path):
         f"{cameras} has 2 cameras, and no images.txt beside it says which image has which; put it there, or write "
         "lines `name MODEL width height params...` with names, `folder/*` or `*`"
     )
-    lines = ["1 1 0 0 0 0 0 0 7 left/0.png", "", "2 1 0 0 0 0 0 0 8 right/0.png", "", ""]
+    lines = ["# IMAGE_ID ...", "", "1 1 0 0 0 0 0 0 7 left/0.png", "", "2 1 0 0 0 0 0 0 8 right/0.png", "", ""]
     (tmp_path / "images.txt").write_text("\n".join(lines))
     known = read_cameras(cameras, tuple(VIEWS))
     assert {name: camera.params[0] for name, camera in known.items()} == {"left/0.png": FOCAL, "right/0.png": 500}
