@@ -23,7 +23,7 @@ from sgam_sfm.images import ImageFile, read_label_map
 from sgam_sfm.label_set import RECORD, Label, LabelSet, at_size_of, read_label_set
 from sgam_sfm.logs import in_one_line
 from sgam_sfm.machine import find_device, out_of_memory
-from sgam_sfm.options import MatchOptions, SegmentOptions
+from sgam_sfm.options import MatchOptions, SegmentOptions, fingerprint_of_labels
 from sgam_sfm.progress import Stages
 from sgam_sfm.segmenters.protocol import Segmenter, fault_of
 
@@ -61,24 +61,28 @@ def segmenter_of_run(options: MatchOptions) -> Segmenter | None:
 def make_label_maps(
     options: MatchOptions, images: Mapping[str, ImageFile], stages: Stages, segmenter: Segmenter | None = None
 ) -> LabelMaps:
-    """The label maps of a run in OUT/labels, at the size that areas are described at; made once.
+    """The label maps of a run in OUT/labels, at the size that areas are described at; made once for the same options.
 
     Args: segmenter: of these options; where there is none, it is made when it is needed.
     """
     folder = options.output / "labels"
-    if not _are_whole(folder, images):
+    mark = fingerprint_of_labels(options, images={name: file.digest for name, file in images.items()})
+    if not _are_whole(folder, images, mark):
         segmenter = segmenter or create_segmenter(options, options.output / "cache")
         name = "labels" if options.labels else options.segmenter
-        write_label_maps(segmenter, name, images, folder, stages, full_size=False)
+        write_label_maps(segmenter, name, images, folder, stages, full_size=False, made_from=mark)
     return LabelMaps(folder=folder, set=read_label_set(folder))
 
 
-def _are_whole(folder: Path, images: Collection[str]) -> bool:
-    """Whether a run has made its label maps, and the disk has kept all of them."""
+def _are_whole(folder: Path, images: Collection[str], mark: str) -> bool:
+    """Whether label maps have been made from the same, and the disk has kept all of them."""
     if not (folder / RECORD).exists():
         return False
     try:
-        failed = read_label_set(folder).failed
+        made = read_label_set(folder)
+        if made.made_from != mark:
+            return False
+        failed = made.failed
         for name in images:
             if name not in failed:
                 with (folder / f"{name}.png").open("rb") as file:
@@ -128,11 +132,13 @@ def write_label_maps(
     *,
     full_size: bool,
     ignored: str = "",
+    made_from: str = "",
 ) -> LabelSet:
     """Segment the collection; labels.json, written last, says that it is whole.
 
     Args: name: of the segmenter. full_size: at the size of the images, else at the size that areas are described at
         (of which the full size is an exact enlargement, where the image is not smaller). ignored: names or ids.
+        made_from: see `LabelSet`.
     """
     failed: dict[str, str] = {}
     pixels: Counter[int] = Counter()
@@ -179,6 +185,7 @@ def write_label_maps(
         ignored=tuple(sorted({*given.ignored, *everything.ids(ignored, "--ignore-labels")})),
         failed=failed,
         facts=_facts(segmenter),
+        made_from=made_from,
     )
     write_json(folder / RECORD, asdict(found))
     return read_label_set(folder)

@@ -40,7 +40,8 @@ class LabelSet:
 
     segmenter: who made the maps. names: how ids are written and what they mean, as `--label-names` says it. labels:
     those that occur. void: the id of pixels without a label. ignored: ids that form no areas. failed: images without a
-    map, and why. facts: what the segmenter reports of itself.
+    map, and why. facts: what the segmenter reports of itself. made_from: a digest of the options and images that the
+    maps of a run follow from.
     """
 
     version: int = 1
@@ -51,6 +52,7 @@ class LabelSet:
     ignored: tuple[int, ...] = ()
     failed: Mapping[str, str] = field(default_factory=dict)
     facts: Mapping[str, object] = field(default_factory=dict)
+    made_from: str = ""
 
     @property
     def by_name(self) -> dict[str, tuple[int, ...]]:

@@ -16,7 +16,7 @@ from sgam_core import Crop, Matches, PointMatcher
 from sgam_core.errors import SGAMError
 from sgam_sfm.files import replacing
 from sgam_sfm.inputs import Inputs
-from sgam_sfm.options import MatchOptions, as_json
+from sgam_sfm.options import MatchOptions, fingerprint_of_points
 from sgam_sfm.runs.matching import create_matcher, is_repeatable, reset
 
 _log = logging.getLogger(__name__)
@@ -45,17 +45,7 @@ class CachedMatcher:
     @staticmethod
     def of(options: MatchOptions, inputs: Inputs, folder: Path) -> CachedMatcher:
         """The point matcher of the options, for these images."""
-        labels = (
-            options.mask_matches,
-            options.labels,
-            options.label_names,
-            options.num_labels,
-            options.seed,
-            *_model(options, "segmenter"),
-        )
-        masks = (options.mask_path, *(labels if options.mask_matches else ()))
-        key = repr((options.weights, options.precision, *_model(options, "matcher"), masks))
-        return CachedMatcher(create_matcher(options), inputs.digests, key, folder)
+        return CachedMatcher(create_matcher(options), inputs.digests, fingerprint_of_points(options), folder)
 
     def start(self) -> None:
         """Begin to count anew."""
@@ -102,11 +92,6 @@ class CachedMatcher:
         sides = [(self.digests[crop.image.name], *crop.key[1:]) for crop in (crop0, crop1)]
         name = hashlib.sha256(repr((self.key, sides)).encode()).hexdigest()[:32]
         return self.folder / name[:2] / f"{name}.npz"
-
-
-def _model(options: MatchOptions, kind: str) -> list[str]:
-    """The options that say which model of a kind it is, and the content of its script."""
-    return [f"{name}={value}" for name, value in as_json(options).items() if name.startswith(kind)]
 
 
 def _write(path: Path, matches: Matches, seconds: float) -> None:

@@ -30,6 +30,7 @@ from sgam_core.options import (
     SemanticOptions,
     TileOptions,
 )
+from sgam_sfm.files import content_digest
 from sgam_sfm.machine import Precision
 from sgam_sfm.merging.keypoints import KeypointOptions
 from sgam_sfm.nearest import unknown
@@ -263,8 +264,12 @@ NOT_IN_RESULTS = AFTER_MATCHING | frozenset(
 cameras themselves count, wherever they are."""
 
 VERSION, _FINGERPRINT = "sgam_sfm_version", "fingerprint"
-_DIGESTS = {"matcher_script": "matcher_script_sha256", "segmenter_script": "segmenter_script_sha256"}
-"""What an options.json holds besides options; of the scripts, their content counts too."""
+_WITH_CONTENT = ("matcher_script", "segmenter_script", "weights", "labels", "label_names", "mask_path")
+SHA256 = "_sha256"
+"""What an options.json holds besides options; of files and folders that results follow from, the content counts too."""
+_OF_LABELS = (VERSION, "segmenter", "label", "num_labels", "resize_labels", "seed")
+_OF_POINTS = (VERSION, "matcher", "weights", "precision", "mask")
+"""How what an options.json holds begins that label maps, and point matches of crops, follow from."""
 
 
 def starting_options(config: Path | None, preset: str | None) -> MatchOptions:
@@ -277,7 +282,7 @@ def starting_options(config: Path | None, preset: str | None) -> MatchOptions:
         raise OptionError(f"--config '{config}': option 'crop' is {content['crop']!r}; expected options by name")
     _group_crop(content)
     made_by = content.pop(VERSION, version("sgam-sfm"))
-    for name in (_FINGERPRINT, *_DIGESTS.values()):
+    for name in (_FINGERPRINT, *(name + SHA256 for name in _WITH_CONTENT)):
         content.pop(name, None)
     try:
         name = preset or content.get("preset", "default")
@@ -360,10 +365,10 @@ def as_json(options: MatchOptions) -> dict[str, Any]:
         value = getattr(options, option.name)
         if isinstance(value, Path) and (value.exists() or option.name != "weights"):  # weights may be a name
             content[option.name] = str(value.absolute())
-    for name, digest in _DIGESTS.items():
-        script: Path | None = getattr(options, name)
-        if script is not None:  # a missing one is told of where it is started
-            content[digest] = hashlib.sha256(script.read_bytes()).hexdigest() if script.is_file() else "missing"
+    for name in _WITH_CONTENT:
+        given: Path | str | None = getattr(options, name)
+        if given and Path(given).exists():  # a missing one is told of where it is used, or is a name
+            content[name + SHA256] = content_digest(Path(given))
     return {VERSION: version("sgam-sfm")} | content
 
 
@@ -375,5 +380,21 @@ def told_options(options: MatchOptions) -> dict[str, Any]:
 def fingerprint(options: MatchOptions, **inputs: Any) -> str:
     """A digest of the options that the results of pairs follow from, and of the inputs."""
     relevant = {name: value for name, value in as_json(options).items() if name not in NOT_IN_RESULTS}
+    return _digest(relevant, inputs)
+
+
+def fingerprint_of_labels(options: MatchOptions, **inputs: Any) -> str:
+    """The same of the options that label maps follow from."""
+    return _digest({name: value for name, value in as_json(options).items() if name.startswith(_OF_LABELS)}, inputs)
+
+
+def fingerprint_of_points(options: MatchOptions) -> str:
+    """The same of the options that the point matches of two crops follow from."""
+    masked = fingerprint_of_labels(options) if options.mask_matches else ""
+    relevant = {name: value for name, value in as_json(options).items() if name.startswith(_OF_POINTS)}
+    return _digest(relevant, {"masked": masked})
+
+
+def _digest(relevant: Mapping[str, Any], inputs: Mapping[str, Any]) -> str:
     text = json.dumps({"options": relevant, "inputs": to_jsonable_python(inputs)}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sgam_core import PRESETS as ALGORITHMS
 from sgam_core import Matches, match_whole
 from sgam_core.errors import InputError, OptionError, SGAMError
 from sgam_core.options import changed
@@ -174,7 +175,7 @@ def _variants(common: MatchOptions, *, ablation: bool) -> list[Variant]:
 
 
 def with_dataset(options: EvaluateOptions) -> EvaluateOptions:
-    """The options with the sizes, angles and format of a data set, as the paper has them.
+    """The options with the sizes and angles of a data set, as the paper has them, unless others are given; its format.
 
     Raises: OptionError for an unknown data set.
     """
@@ -183,10 +184,12 @@ def with_dataset(options: EvaluateOptions) -> EvaluateOptions:
     if options.dataset not in PRESETS:
         raise OptionError(unknown("--dataset", options.dataset, PRESETS))
     preset = PRESETS[options.dataset]
+    area_size, degrees = options.crop.area_size, options.auc_degrees
+    by_default = area_size == ALGORITHMS[options.preset].crop.area_size
     return replace(
         options,
-        crop=replace(options.crop, area_size=preset.area_size),
-        auc_degrees=preset.auc_angles,
+        crop=replace(options.crop, area_size=preset.area_size if by_default else area_size),
+        auc_degrees=preset.auc_angles if degrees == EvaluateOptions.auc_degrees else degrees,
         ground_truth_format=preset.format,
     )
 

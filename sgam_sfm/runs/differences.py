@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Set
 from typing import Any
 
-from sgam_sfm.options import NOT_IN_RESULTS, VERSION
+from sgam_sfm.options import NOT_IN_RESULTS, SHA256, VERSION
+
+_CONTENT = "content of "
 
 Told = tuple[Mapping[str, Any], Mapping[str, Any]]
 """The contents of a run's options.json and inputs.json."""
@@ -15,7 +17,7 @@ def difference(there: Told, here: Told) -> str:
     """What differs of all that results follow from: options, else images, pairs, or cameras where nothing else does."""
     flags_there, flags_here = _flags(there[0]), _flags(here[0])
     changed = [
-        f"{flag} ({flags_there.get(flag)} there, {value} here)"
+        flag if flag.startswith(_CONTENT) else f"{flag} ({flags_there.get(flag)} there, {value} here)"
         for flag, value in flags_here.items()
         if flags_there.get(flag) != value
     ]
@@ -53,6 +55,7 @@ def _flags(options: Mapping[str, Any], prefix: str = "--") -> dict[str, Any]:
     for name, value in options.items():
         if prefix == "--" and name in NOT_IN_RESULTS | {"fingerprint"}:
             continue
-        flag = "version of sgam-sfm" if name == VERSION else prefix + name.replace("_", "-")
+        flag = "version of sgam-sfm" if name == VERSION else prefix + name.removesuffix(SHA256).replace("_", "-")
+        flag = _CONTENT + flag if name.endswith(SHA256) else flag
         flat |= _flags(value, "--" if name == "crop" else f"{flag}.") if isinstance(value, dict) else {flag: value}
     return flat

@@ -18,7 +18,6 @@ from sgam_sfm.executors import MatchingJob, open_executor
 from sgam_sfm.files import write_json
 from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import make_label_maps, segmenter_of_run
-from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import peak_memory_mb
 from sgam_sfm.options import MatchOptions, as_json, fingerprint
 from sgam_sfm.pairs import Pair, blocks
@@ -208,17 +207,11 @@ def open_store(options: MatchOptions, inputs: Inputs) -> PairStore:
         before = json_object(path)
         if not before:
             _log.warning("'%s' is damaged, and is written anew", path)
-        if before.get("fingerprint") != mark:
-            if before and stored_files(options.output):
-                there, here = (before, json_object(options.output / "inputs.json")), (now, known)
-                told = (
-                    f"'{options.output}' was begun with other {difference(there, here)}; choose a new --output folder"
-                )
-                later = goes_on(there, here) and database.is_file()
-                raise OptionError(
-                    told + (f", and list the later pairs alone, with --database {database}" if later else "")
-                )
-            (options.output / "labels" / RECORD).unlink(missing_ok=True)  # they follow from the options too
+        if before.get("fingerprint") != mark and before and stored_files(options.output):
+            there, here = (before, json_object(options.output / "inputs.json")), (now, known)
+            told = f"'{options.output}' was begun with other {difference(there, here)}; choose a new --output folder"
+            later = goes_on(there, here) and database.is_file()
+            raise OptionError(told + (f", and list the later pairs alone, with --database {database}" if later else ""))
         other = before.get("shard", "")
         if options.shard and other not in ("", options.shard):
             raise OptionError(

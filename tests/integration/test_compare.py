@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import PIL.Image
 import pytest
 
 from sgam_core.errors import InputError
+from sgam_core.options import CropOptions
 from sgam_sfm import cli
+from sgam_sfm.evaluation.evaluate import with_dataset
+from sgam_sfm.evaluation.options import EvaluateOptions
 from sgam_sfm.exit_codes import DONE, ERROR, USAGE
 from sgam_sfm.images import read_image
 from sgam_sfm.scene import write_ground_truth
@@ -240,6 +244,13 @@ def test_evaluate_takes_frames_that_are_so_far_apart_and_the_angles_of_a_data_se
     content = json.loads((output / "evaluate.json").read_text())
     pairs = [tuple(pair["pair"]) for pair in content["variants"][0]["pairs"]]
     assert pairs == [("view02.jpg", "view04.jpg"), ("view03.jpg", "view05.jpg")]
+
+
+def test_sizes_and_angles_that_are_given_are_not_those_of_the_data_set(tmp_path):
+    given = EvaluateOptions(images=tmp_path, output=tmp_path, ground_truth=tmp_path, dataset="matterport3d")
+    assert (with_dataset(given).crop.area_size, with_dataset(given).auc_degrees) == (480, (10, 20, 30))
+    given = replace(given, crop=CropOptions(area_size=700), auc_degrees=(3.0,))
+    assert (with_dataset(given).crop.area_size, with_dataset(given).auc_degrees) == (700, (3.0,))
 
 
 def test_evaluate_without_a_known_pose_says_how_names_differ(folder, tmp_path, capsys):

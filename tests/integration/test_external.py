@@ -407,7 +407,7 @@ def test_a_run_with_two_workers_resumes_only_with_the_same(folder, other_python,
     assert starting_options(tmp_path / "out/options.json", None).matcher_script == matcher
     matcher.write_text(SIFT.read_text() + "# another one\n")
     assert cli.run(given) == USAGE
-    assert "was begun with other --matcher-script-sha256 (" in capsys.readouterr().err
+    assert "was begun with other content of --matcher-script; choose" in capsys.readouterr().err
 
 
 def test_a_worker_that_gives_up_ends_the_run_and_not_only_its_pairs(folder, write, tmp_path, capsys):

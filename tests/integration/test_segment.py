@@ -15,7 +15,7 @@ from sgam_core.errors import StageError, WeightsError
 from sgam_sfm import cli, registry
 from sgam_sfm.colmap.reading import database_content
 from sgam_sfm.exit_codes import DONE, ERROR, SOME_FAILED, USAGE
-from sgam_sfm.images import read_label_map
+from sgam_sfm.images import ImageFile, read_label_map
 from sgam_sfm.inputs import read_images
 from sgam_sfm.label_maps import make_label_maps, write_label_maps
 from sgam_sfm.label_set import read_label_set
@@ -160,14 +160,36 @@ def test_ignored_labels_form_no_area_and_masked_ones_no_match(room, folder, tmp_
     assert sum(map(len, points.values())) > 500
 
 
-def test_masking_by_labels_works_for_whole_images_too(room, folder, tmp_path):
-    output = tmp_path / "out"
+def test_masking_by_labels_works_for_whole_images_too(room, folder, tmp_path, capsys):
+    folder, output = shutil.copytree(folder, tmp_path / "room"), tmp_path / "out"
     assert cli.run(matching(folder, output, "--area-matcher", "none", "--mask-matches", "wall")) == DONE
     for record in read_pairs_of(output):
         x, y = record.result.matches.points0.astype(int).T
         hidden = (room.renderings[record.pair[0]].labels == LABELS["wall"]).astype(np.uint8)
         assert not cv2.erode(hidden, np.ones((5, 5)))[y, x].any()
         assert record.result.fallback == "no area match"
+    changed = next((folder / "labels").glob("*.png"))
+    PIL.Image.fromarray(np.ones_like(read_label_map(changed), np.uint8)).save(changed)
+    assert cli.run(matching(folder, output, "--area-matcher", "none", "--mask-matches", "wall")) == USAGE
+    assert "was begun with other content of --labels; choose a new --output" in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
+def test_label_maps_are_made_once_from_the_same(tmp_path):
+    image = ImageFile(name="a.jpg", path=tmp_path / "a.jpg", width=40, height=30, digest="1")
+    for folder, ids in (("two", 2), ("three", 3)):
+        (tmp_path / folder).mkdir()
+        PIL.Image.fromarray(np.arange(1200, dtype=np.uint8).reshape(30, 40) % ids).save(tmp_path / folder / "a.jpg.png")
+
+    def made(labels: str) -> int:
+        options = MatchOptions(images=tmp_path, output=tmp_path / "out", labels=tmp_path / labels)
+        return len(make_label_maps(options, {"a.jpg": image}, Stages(quiet=True)).set.labels)
+
+    assert (made("two"), made("three")) == (1, 2)  # 0 is unknown
+    written = (tmp_path / "out" / "labels" / "labels.json").stat().st_mtime_ns
+    assert made("three") == 2
+    assert (tmp_path / "out" / "labels" / "labels.json").stat().st_mtime_ns == written
 
 
 @pytest.mark.parametrize("flag", ["--ignore-labels", "--mask-matches"])

@@ -17,6 +17,7 @@ def run(options=None, **inputs):
         (run({"matcher": "loftr"}), "--matcher (sift there, loftr here)"),
         (run({"matcher": "sift", "threads": 2}), "cameras"),  # results do not follow from the number of threads
         (run({"matcher": "sift", "crop": {"area_size": 3}}), "--area-size (None there, 3 here)"),
+        (run({"matcher": "sift", "labels_sha256": "3"}), "content of --labels"),
         (run(images={"a.jpg": "3", "b.jpg": "2"}), "images (1 with another content, 'a.jpg' for one)"),
         (
             run(images={"a.jpg": "1", "c.jpg": "2", "d.jpg": "4"}),

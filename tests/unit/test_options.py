@@ -1,6 +1,7 @@
 """Options from files: misspelt, of another type, of another version; what options.json holds."""
 
 import json
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import get_args
@@ -9,9 +10,18 @@ import pytest
 
 from sgam_core import PRESETS
 from sgam_core.errors import OptionError
+from sgam_core.options import CropOptions, changed
 from sgam_sfm import cli
 from sgam_sfm.exit_codes import DONE
-from sgam_sfm.options import VERSION, MatchOptions, Preset, as_json, fingerprint, starting_options
+from sgam_sfm.options import (
+    VERSION,
+    MatchOptions,
+    Preset,
+    as_json,
+    fingerprint,
+    fingerprint_of_points,
+    starting_options,
+)
 
 
 def written(tmp_path: Path, content: object, name: str = "c.json") -> Path:
@@ -88,6 +98,38 @@ def test_presets_are_those_that_can_be_named():
     assert fast.crop.image_size == default.crop.image_size  # what its time is compared at
     assert fast.crop.max_crop_pixels < default.crop.max_crop_pixels / 2
     assert fast.geometry == default.geometry
+
+
+def test_results_follow_from_the_content_of_masks_and_maps(tmp_path):
+    masks = tmp_path / "masks"
+    (masks / "left").mkdir(parents=True)
+    (masks / "left" / "a.jpg.png").write_bytes(b"1")
+    options = MatchOptions(images=Path("a"), output=Path("out"), mask_path=masks)
+    before = fingerprint(options), fingerprint_of_points(options)
+    assert (fingerprint(options), fingerprint_of_points(options)) == before
+    (masks / "notes.txt").write_text("no mask")
+    assert (fingerprint(options), fingerprint_of_points(options)) == before
+    (masks / "left" / "a.jpg.png").write_bytes(b"other")
+    assert fingerprint(options) != before[0]
+    assert fingerprint_of_points(options) != before[1]
+
+
+def test_masks_by_labels_decide_points_and_areas_alone_do_not():
+    plain, masked = (MatchOptions(images=Path("a"), output=Path("out"), mask_matches=mask) for mask in ("", "1"))
+    assert fingerprint_of_points(plain) == fingerprint_of_points(replace(plain, num_labels=9))
+    assert fingerprint_of_points(masked) != fingerprint_of_points(replace(masked, num_labels=9))
+    assert fingerprint_of_points(plain) == fingerprint_of_points(changed(plain, crop__area_size=9))
+
+
+@pytest.mark.parametrize(("size", "pixels"), [((3072, 2048), 4000), ((2000, 3000), 4000), ((500, 500), 6000)])
+def test_areas_have_pixels_in_proportion_to_whole_images(size, pixels):
+    assert CropOptions(max_crop_pixels=4000).of_shapes(size, size).max_crop_pixels == pixels
+    assert CropOptions(max_crop_pixels=4000).of_shapes(size, (200, 300)).max_crop_pixels == (pixels + 4000) / 2
+
+
+def test_no_shape_turns_a_limit_of_pixels_into_none():
+    assert CropOptions(max_crop_pixels=0).of_shapes((1, 1), (9, 4)).max_crop_pixels == 0
+    assert CropOptions(max_crop_pixels=1).of_shapes((1, 9999), (1, 9999)).max_crop_pixels == 1
 
 
 def test_results_follow_from_images_not_from_where_they_are(tmp_path):
