@@ -11,11 +11,14 @@ from __future__ import annotations
 from dataclasses import replace
 from operator import itemgetter
 
-from scipy.stats import binom
+from scipy.stats import hypergeom
 
 from sgam_core.covisible import Frame, enclosing_box
 from sgam_core.options import GuidanceOptions
 from sgam_core.types import AreaMatch, AreaState, Matches, PutativeAreas
+
+_ALL = 0.95  # of the matches: an area that holds so many is what its whole image shows
+_FEWEST = 8  # matches in both areas of such a pair
 
 
 def supported(
@@ -26,8 +29,8 @@ def supported(
     Certain area pairs are cut to the ground that both areas show, and put in order, those with most support first.
     Doubtful ones stay whole: of those that share an area only one can be true.
 
-    Args: matches: of the whole images. options: `max_chance`, the probability that as many of the matches that begin in
-        the first area end in the second one, if they end there like all others do; `min_overlap`, the share of the
+    Args: matches: of the whole images. options: `max_chance`, the probability that so many matches lie in both areas,
+        if those that begin in the first one end in the second one like all others do; `min_overlap`, the share of the
         matches of either area that must lie in the other one; that of the first one is the paper's AOR, as far as
         matches can tell it.
     """
@@ -45,8 +48,10 @@ def _judged(
 ) -> tuple[float, AreaMatch]:
     """The probability of chance, and the area pair with its state. Args: frames: the images of what is to be cut."""
     inside0, inside1 = area.area0.box.contains(matches.points0), area.area1.box.contains(matches.points1)
-    joined, leaving = int((inside0 & inside1).sum()), int(inside0.sum())
-    chance = float(binom.sf(joined - 1, leaving, inside1.mean())) if joined else 1.0
+    joined, leaving, arriving = (int(inside.sum()) for inside in (inside0 & inside1, inside0, inside1))
+    chance = float(hypergeom.sf(joined - 1, len(matches), arriving, leaving)) if joined else 1.0
+    if joined >= _FEWEST and max(leaving, arriving) >= _ALL * len(matches):
+        chance = options.max_chance  # one image shows the other's area from near: chance tells nothing, overlap may
     if chance > options.max_chance:
         reason = (
             f"{joined} of {leaving} whole-image matches in its first area end in its second one, no more than chance"

@@ -54,6 +54,21 @@ def test_areas_that_matches_join_stay_and_others_are_skipped_with_the_reason():
     assert skipped.reason.endswith("whole-image matches in its first area end in its second one, no more than chance")
 
 
+@pytest.mark.parametrize("wrong", [0, 40])
+@pytest.mark.parametrize("swapped", [False, True])
+def test_an_area_that_the_other_image_shows_from_near_stays(wrong, swapped):
+    small, whole = Box(x0=20, y0=20, x1=50, y1=50), Box(x0=0, y0=0, x1=100, y1=99)
+    rng = np.random.default_rng(0)
+    points0 = np.concatenate([rng.uniform(20, 50, (60, 2)), rng.uniform(0, 100, (wrong, 2))])
+    found = Matches(points0=points0, points1=rng.uniform(0, 100, points0.shape), scores=np.ones(len(points0)))
+    pair = area_match(small, whole)
+    if swapped:
+        pair, found = area_match(whole, small), found.swapped()
+    assert judged_areas(PutativeAreas(confident=(pair,)), found, 0.01, 0.5).confident == (pair,)
+    few = found.select(np.arange(7))
+    assert judged_areas(PutativeAreas(confident=(pair,)), few, 0.01, 0.5).confident[0].state is AreaState.SKIPPED
+
+
 @given(st.integers(0, 400), st.integers(0, 1000))
 def test_chance_is_rarely_taken_for_support(wrong, seed):
     judged = judged_areas(PutativeAreas(confident=(area_match(LEFT, LEFT),)), matches(0, wrong, seed), 1e-9, 0.0)
