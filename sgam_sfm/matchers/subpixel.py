@@ -91,7 +91,10 @@ def refine(
 def _aligned_patches(
     smooth: Sequence[tuple[int, np.ndarray, np.ndarray]], points0: np.ndarray, points1: np.ndarray, affines: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Args: smooth: a stride, and both images as they are sampled with it."""
+    """`refine` of as many points as there is memory for.
+
+    Args: smooth: a stride, and both images as they are sampled with it.
+    """
     correlation = np.zeros(len(points0))
     for stride, smooth0, smooth1 in smooth:
         template, contrast0 = _patches(smooth0, points0, stride * _GRID)

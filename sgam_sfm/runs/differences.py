@@ -25,10 +25,14 @@ def difference(there: Told, here: Told) -> str:
 
 
 def goes_on(there: Told, here: Told) -> bool:
-    """Whether the same is matched here, and more pairs."""
+    """Whether the same is matched here, and more pairs; of masks and label maps more may be there, too."""
+    flags_there, flags_here = (
+        {flag: value for flag, value in _flags(options).items() if not flag.startswith(_CONTENT)}
+        for options, _ in (there, here)
+    )
     images_there, images_here = (inputs.get("images", {}).items() for _, inputs in (there, here))
     pairs_there, pairs_here = (set(map(tuple, inputs.get("pairs", ()))) for _, inputs in (there, here))
-    return _flags(there[0]) == _flags(here[0]) and images_there <= images_here and pairs_there < pairs_here
+    return flags_there == flags_here and images_there <= images_here and pairs_there < pairs_here
 
 
 def _images(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:

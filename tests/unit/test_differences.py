@@ -43,6 +43,7 @@ MORE = {"images": INPUTS["images"] | {"c.jpg": "3"}, "pairs": [*INPUTS["pairs"],
     [
         (run(**MORE), True),
         (run(pairs=[*INPUTS["pairs"], ["b.jpg", "a.jpg"]]), True),
+        (run({"matcher": "sift", "mask_path_sha256": "3"}, **MORE), True),
         (run(), False),  # cameras
         (run({"matcher": "loftr"}, **MORE), False),
         (run(**(MORE | {"pairs": [["b.jpg", "c.jpg"]]})), False),
