@@ -59,6 +59,10 @@ def child(pipe: int) -> int:
 
 def _stop_cleanly() -> None:
     """Make SIGTERM a clean stop as Ctrl-C is; a stop can arrive twice, from the terminal and from the supervisor."""
+    import zlib  # noqa: F401  (before pycolmap, see `sgam_sfm.colmap`)
+
+    import pycolmap  # noqa: F401  (which takes SIGTERM for itself when it is imported: not after us)
+
     last = -_SECONDS_OF_ONE_STOP
 
     def stop(number: int, frame: FrameType | None) -> None:

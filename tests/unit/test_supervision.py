@@ -89,6 +89,7 @@ import time, types
 from sgam_sfm.runs import supervision
 
 def run(arguments):
+    import pycolmap  # which takes SIGTERM for itself
     try:
         print("begun", flush=True)
         time.sleep(60)
