@@ -66,6 +66,9 @@ class CropOptions(_Checked):
     def __post_init__(self) -> None:
         _Checked.__post_init__(self)
         self._is_upsampling("max_upsampling", "max_whole_upsampling")
+        for name in ("area_size", "image_size"):
+            if (value := getattr(self, name)) < 1:
+                raise OptionError(f"{name} is {value}; expected at least 1 pixel")
 
     def of_shapes(self, *sizes: tuple[int, int]) -> CropOptions:
         """The same with `max_crop_pixels` for a pair of images of these sizes (width, height).

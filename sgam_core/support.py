@@ -53,17 +53,15 @@ def _judged(
     if joined >= _FEWEST and max(leaving, arriving) >= _ALL * len(matches):
         chance = options.max_chance  # one image shows the other's area from near: chance tells nothing, overlap may
     if chance > options.max_chance:
-        reason = (
-            f"{joined} of {leaving} whole-image matches in its first area end in its second one, no more than chance"
-        )
+        reason = f"{joined} of {leaving} whole-image matches lead from area to area: no more than chance"
         return chance, _skipped(area, reason)
     if frames is not None and joined >= max(options.min_matches, 1):
         area = _cut(area, matches.select(inside0 & inside1), frames, options)
         inside0, inside1 = area.area0.box.contains(matches.points0), area.area1.box.contains(matches.points1)
     joined, leaving, arriving = (int(inside.sum()) for inside in (inside0 & inside1, inside0, inside1))
     if joined < options.min_overlap * max(leaving, arriving):
-        ends = f"{joined} whole-image matches lie in both its areas, {leaving} in the first, {arriving} in the second"
-        return chance, _skipped(area, f"{ends}: they overlap in part")
+        reason = f"its areas share {joined} of {leaving} and {arriving} whole-image matches: they overlap in part"
+        return chance, _skipped(area, reason)
     return chance, area
 
 

@@ -41,6 +41,7 @@ def run(options: EvaluateOptions, console: Console) -> int:
     with logging_to(options.output / "log.txt", console, verbose=options.verbose, as_json=options.log_json):
         content = evaluate(options, Stages(console=console))
     _print(content, console)
+    console.print(f"figures    {options.output / 'evaluate.json'}", highlight=False, markup=False, soft_wrap=True)
     return DONE
 
 

@@ -22,7 +22,7 @@ from sgam_sfm.inputs import Inputs, read_inputs
 from sgam_sfm.label_maps import create_segmenter, write_label_maps
 from sgam_sfm.label_set import RECORD
 from sgam_sfm.machine import find_device
-from sgam_sfm.options import AFTER_MATCHING, MatchOptions, as_json, fingerprint, told_options
+from sgam_sfm.options import AFTER_MATCHING, MatchOptions, as_json, fingerprint, fingerprint_of_labels, told_options
 from sgam_sfm.pairs import spread_over, write_pairs
 from sgam_sfm.progress import Stages
 from sgam_sfm.runs.matching import create_area_matcher, create_matcher
@@ -99,7 +99,7 @@ def _labels(
     if not common.mask_matches and not any(needed):
         return None
     wanted = replace(common, seed=seed)
-    folder = output / "labels" / f"seed-{seed}-{fingerprint(wanted, images=inputs.digests)[:8]}"
+    folder = output / "labels" / f"seed-{seed}-{fingerprint_of_labels(wanted, images=inputs.digests)[:8]}"
     if not (folder / RECORD).exists():
         segmenter = create_segmenter(wanted, output / "cache" / "segmenter")
         write_label_maps(segmenter, common.segmenter, inputs.images, folder, stages, full_size=True)

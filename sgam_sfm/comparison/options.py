@@ -43,5 +43,10 @@ class CompareOptions(MatchOptions):
             raise OptionError(
                 "--executor ray and --shard are for `sgam-sfm match`; leave them out: compare is one process"
             )
+        if (self.matcher, self.area_matcher) != (MatchOptions.matcher, MatchOptions.area_matcher):
+            raise OptionError(
+                "--matcher and --area-matcher are for `sgam-sfm match`; here methods name theirs: --methods "
+                f"{self.area_matcher}:{self.matcher} ..."
+            )
         if self.database is not None or self.append:
             raise OptionError("--database and --append are for `sgam-sfm match`; compare makes its own")

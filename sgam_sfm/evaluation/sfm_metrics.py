@@ -6,7 +6,7 @@ degrees, distances the unit of the ground truth.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -51,7 +51,7 @@ def align(estimated: Poses, true: Poses, seed: int = 0) -> Similarity | None:
 
     Every two images that both know make a hypothesis: rotation from their orientations, scale and translation from
     their centres. The one with the least median distance of centres wins (right while most images are), and is fitted
-    again to the centres that it explains; their orientations stay decisive where the centres lie on a line.
+    again to the centres that it explains; their orientations stay decisive where the centres lie exactly on a line.
     Returns: None with fewer than two such images, or when all centres are one point.
     Source: Umeyama 1991 for the last fit; Rousseeuw 1984, least median of squares.
     """
@@ -59,7 +59,7 @@ def align(estimated: Poses, true: Poses, seed: int = 0) -> Similarity | None:
     if len(names) < 2:
         return None
     source, target = (np.array([_centre(poses[name]) for name in names]) for poses in (estimated, true))
-    turns = Rotation.from_matrix([true[name][:, :3].T @ estimated[name][:, :3] for name in names])
+    turns = _turns(estimated, true, names)
     pairs = np.column_stack(np.triu_indices(len(names), 1))
     if len(pairs) > _MAX_HYPOTHESES:
         rng = np.random.default_rng(seed)
@@ -79,14 +79,21 @@ def align(estimated: Poses, true: Poses, seed: int = 0) -> Similarity | None:
 
 
 def camera_errors(estimated: Poses, true: Poses, similarity: Similarity) -> dict[str, CameraError]:
-    """Error of every image that both know, by name, after alignment."""
+    """Error of every image that both know, by name, after alignment.
+
+    Orientations are turned alike to agree with the true ones on the whole: centres that nearly lie on a line leave a
+    turn about it open, which is no error of any camera.
+    """
+    turn = similarity.rotation
+    if similarity.inliers:
+        turn = _turns(estimated, true, similarity.inliers).mean().as_matrix()
     errors = {}
     for name in sorted({*estimated} & {*true}):
         centre = similarity(_centre(estimated[name])[None])[0]
-        turn = estimated[name][:, :3] @ similarity.rotation.T @ true[name][:, :3].T
+        off = estimated[name][:, :3] @ turn.T @ true[name][:, :3].T
         errors[name] = CameraError(
             centre=float(np.linalg.norm(centre - _centre(true[name]))),
-            rotation=float(np.rad2deg(Rotation.from_matrix(turn).magnitude())),
+            rotation=float(np.rad2deg(Rotation.from_matrix(off).magnitude())),
         )
     return errors
 
@@ -127,6 +134,11 @@ def track_lengths(point_ids: Int[np.ndarray, " O"], image_ids: Int[np.ndarray, "
     lengths = np.unique(distinct[:, 0], return_counts=True)[1]
     histogram = {int(length): int(count) for length, count in zip(*np.unique(lengths, return_counts=True), strict=True)}
     return TrackLengths(mean=float(lengths.mean()), histogram=histogram)
+
+
+def _turns(estimated: Poses, true: Poses, names: Sequence[str]) -> Rotation:
+    """What each image says of the rotation from the one world to the other."""
+    return Rotation.from_matrix([true[name][:, :3].T @ estimated[name][:, :3] for name in names])
 
 
 def _centre(pose: np.ndarray) -> np.ndarray:

@@ -244,9 +244,9 @@ def _mutual_nearest(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Rows of both sides that are each other's nearest by cosine, and the cosines (M,).
 
-    The similarity matrix is made in blocks of rows, one after the other in the same memory: so it is bounded, and on the
-    CPU new memory for each would take a sixth of the time. A pair is mutual when the maximum of its row is that of its
-    column.
+    The similarity matrix is made in blocks of rows, one after the other in the same memory: so it is bounded, and new
+    memory for each would take a sixth of the time on the CPU. A pair is mutual when the maximum of its row is that of
+    its column.
     """
     if not (len(descriptors0) and len(descriptors1)):
         none = torch.zeros(0, dtype=torch.int64, device=descriptors0.device)

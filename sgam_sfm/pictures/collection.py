@@ -74,7 +74,8 @@ class CollectionPicture:
     """What is drawn of a collection.
 
     entries: its images in order. inliers: of the verified pairs. num_listed: pairs of the list. num_matched,
-    num_failed: those of them that were matched, and that failed. missing: what cannot be drawn, and why.
+    num_failed: those of them that were matched, and that failed, also for an image that cannot be used. missing: what
+    cannot be drawn, and why.
     """
 
     title: str
@@ -118,7 +119,8 @@ def _facts(picture: CollectionPicture, num_shown: int) -> list[str]:
     registered = {model: sum(entry.model == model for entry in entries) for model in models}
     if registered:
         parts = (f"model {model} has {counted(count, 'image')}" for model, count in registered.items())
-        lines.append(f"{', '.join(parts)}; images without a pose: {sum(entry.model == '' for entry in entries)}.")
+        without = sum(entry.trouble == "no pose" for entry in entries)
+        lines.append(f"{', '.join(parts)}; images without a pose: {without}.")
     if picture.missing:
         lines.append(f"Not in this picture: {'; '.join(picture.missing)}.")
     if num_shown < len(entries):

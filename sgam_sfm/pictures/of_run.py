@@ -112,6 +112,7 @@ def collection_picture(results: Results) -> Figure:
     why = "`localize` makes no database" if results.references else "no database.db"
     missing = [f"keypoints and verified pairs ({why})"] if counts is None else []
     missing += [] if models else ["registered images (no model in sparse)"]
+    unusable = sum(not results.failed.keys().isdisjoint(pair) for pair in results.listed - results.blocks.keys())
     return draw_collection(
         CollectionPicture(
             title=results.folder.resolve().name,
@@ -119,7 +120,7 @@ def collection_picture(results: Results) -> Figure:
             inliers=verified,
             num_listed=len(results.listed),
             num_matched=len(results.blocks) - len(results.errors),
-            num_failed=len(results.errors),
+            num_failed=len(results.errors) + unusable,
             missing=missing,
         ),
         thumbnail,

@@ -14,14 +14,14 @@ Told = tuple[Mapping[str, Any], Mapping[str, Any]]
 
 
 def difference(there: Told, here: Told) -> str:
-    """What differs of all that results follow from: options, else images, pairs, or cameras where nothing else does."""
+    """What differs of all that results follow from: options, images, pairs, or cameras where nothing else does."""
     flags_there, flags_here = _flags(there[0]), _flags(here[0])
     changed = [
         flag if flag.startswith(_CONTENT) else f"{flag} ({flags_there.get(flag)} there, {value} here)"
         for flag, value in flags_here.items()
         if flags_there.get(flag) != value
     ]
-    return ", ".join(changed or [*_images(there[1], here[1]), *_pairs(there[1], here[1])]) or "cameras"
+    return ", ".join([*changed, *_images(there[1], here[1]), *_pairs(there[1], here[1])]) or "cameras"
 
 
 def goes_on(there: Told, here: Told) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import distributions, version
@@ -19,6 +20,7 @@ from sgam_sfm.colmap.verification import VerificationSummary
 from sgam_sfm.inputs import Inputs
 from sgam_sfm.merging.keypoints import CollectionKeypoints
 from sgam_sfm.nearest import listing
+from sgam_sfm.pairs import Pair
 from sgam_sfm.runs.store import PairRecord
 
 _PACKAGES = ("sgam-sfm", "pycolmap", "torch", "kornia", "numpy", "numba", "opencv-python-headless", "onnxruntime")
@@ -43,6 +45,7 @@ class CountedPairs:
         self._fallbacks: Counter[str] = Counter()
         self._totals: Counter[str] = Counter()
         self._failed: dict[str, str] = {}
+        self._limited: Pair | None = None
         self._coverage = self._scale = 0.0
 
     def __iter__(self) -> Iterator[PairRecord]:
@@ -58,7 +61,9 @@ class CountedPairs:
         self._totals["pairs"] += 1
         self._totals["raw_matches"] += len(result.matches)
         self._totals["pixels_matched"] += result.pixels_matched
-        self._totals["pairs_with_limits"] += bool(result.notes)
+        if result.notes:
+            self._totals["pairs_with_limits"] += 1
+            self._limited = self._limited or record.pair
         self._totals["pairs_turned"] += bool(result.turned)
         self._totals["pairs_zoomed"] += result.zoom != 1
         self._coverage += (result.coverage0 + result.coverage1) / 2
@@ -81,6 +86,7 @@ class CountedPairs:
             "mean_coverage": self._coverage / max(self._totals["pairs"], 1),
             "mean_resolution_gain": self._scale / max(self._totals["areas_kept"], 1),
             "pairs_with_limits": self._totals["pairs_with_limits"],
+            "pair_with_limits": self._limited,
             "pairs_turned": self._totals["pairs_turned"],
             "pairs_zoomed": self._totals["pairs_zoomed"],
             "raw_matches": self._totals["raw_matches"],
@@ -167,9 +173,8 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
         turned = f"{counted(pairs['pairs_turned'], 'pair')} with a turned image"
         table.add_row("looks", f"{turned}, {pairs['pairs_zoomed']} with one from nearer")
     if pairs["pairs_with_limits"]:
-        table.add_row(
-            "limits", f"reached in {counted(pairs['pairs_with_limits'], 'pair')} (`sgam-sfm show` tells which)"
-        )
+        look = shlex.join(["sgam-sfm", "show", "OUT", *pairs["pair_with_limits"]])
+        table.add_row("limits", f"reached in {counted(pairs['pairs_with_limits'], 'pair')}; for one: {look}")
     table.add_row("matches", f"{pairs['raw_matches']} raw, {summary['keypoints']['matches']} as tracks")
     _add_models(summary, table)
     console.print(table)

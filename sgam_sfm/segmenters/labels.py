@@ -33,8 +33,9 @@ class LabelFolder:
     def __init__(self, folder: Path, resize: bool = False, label_names: str = "") -> None:
         if not folder.is_dir():
             raise InputError(f"--labels '{folder}' does not exist; give the folder that holds <image name>.png")
-        self.folder, self.resize = folder, resize
+        self.folder = folder
         self._given = read_label_set(folder)
+        self.resize = resize or bool(self._given.made_from)  # those of a run have the size that areas are described at
         self._table: LabelTable | None = None
         if label_names or self._given.names:
             self._table = find_table(label_names) if label_names else find_table(self._given.names, folder)

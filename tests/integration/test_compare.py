@@ -246,6 +246,12 @@ def test_evaluate_takes_frames_that_are_so_far_apart_and_the_angles_of_a_data_se
     assert pairs == [("view02.jpg", "view04.jpg"), ("view03.jpg", "view05.jpg")]
 
 
+def test_methods_name_their_matchers(folder, tmp_path, capsys):
+    given = ["compare", *common(folder, tmp_path / "out"), "--methods", *METHODS, "--area-matcher", "tiles"]
+    assert cli.run(given) == USAGE
+    assert "here methods name theirs: --methods tiles:xfeat-star ..." in " ".join(capsys.readouterr().err.split())
+
+
 def test_sizes_and_angles_that_are_given_are_not_those_of_the_data_set(tmp_path):
     given = EvaluateOptions(images=tmp_path, output=tmp_path, ground_truth=tmp_path, dataset="matterport3d")
     assert (with_dataset(given).crop.area_size, with_dataset(given).auc_degrees) == (480, (10, 20, 30))

@@ -17,8 +17,8 @@ import PIL.Image
 import pytest
 
 from sgam_sfm import cli
-from sgam_sfm.colmap.pose_errors import compare_poses
 from sgam_sfm.colmap.reading import database_content
+from sgam_sfm.evaluation.pose_errors import compare_poses
 from sgam_sfm.exit_codes import DONE, ERROR, SOME_FAILED, USAGE
 from sgam_sfm.runs.matching import CollectionMatcher
 from sgam_sfm.runs.store import read_pairs_of

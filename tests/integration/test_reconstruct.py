@@ -13,8 +13,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from sgam_sfm import MatchOptions, cli, match_collection
-from sgam_sfm.colmap.pose_errors import compare_poses
 from sgam_sfm.colmap.reading import database_content, read_model, read_poses_and_points
+from sgam_sfm.evaluation.pose_errors import compare_poses
 from sgam_sfm.exit_codes import DONE, ERROR, USAGE
 from tests.arc import ARC, FOCAL, POINTS, ArcMatcher, write_arc
 

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from sgam_core.types import Area, AreaMatch, Box, Matches, PairResult
 from sgam_sfm import demo
-from sgam_sfm.colmap.pose_errors import PoseErrors
+from sgam_sfm.evaluation.pose_errors import PoseErrors
 from sgam_sfm.options import MatchOptions
 from sgam_sfm.runs.store import PairRecord
 
@@ -56,7 +56,12 @@ def test_it_ends_with_what_was_made_and_how_to_look_at_it(monkeypatch, tmp_path,
     for name in ("scene/pairs.txt", "scene/images/view00.jpg"):
         (output / name).touch()
     errors = PoseErrors(
-        num_images=14, median_center=0.005, max_center=0.01, median_rotation_deg=0.06, max_rotation_deg=0.1
+        num_images=14,
+        median_center=0.005,
+        max_center=0.01,
+        median_rotation_deg=0.06,
+        max_rotation_deg=0.1,
+        worst="view03.jpg",
     )
     monkeypatch.setattr(demo, "match_collection", lambda options, stages: {"models": models})
     monkeypatch.setattr(demo, "print_summary", lambda summary, console: None)
@@ -67,6 +72,8 @@ def test_it_ends_with_what_was_made_and_how_to_look_at_it(monkeypatch, tmp_path,
     demo.run_demo(output, "cpu", 0, Console(file=file))
     lines = file.getvalue().splitlines()
     assert {"picture    pictures/a.png", f"database   {output}/sgam/database.db"} <= set(lines)
+    told = [line for line in lines if line.startswith("truth      camera centres off by 5.0 mm, ")]
+    assert [line.endswith("; furthest off is view03.jpg, by 10.0 mm") for line in told] == [True] * len(models)
     assert (f"model      {output}/sgam/sparse/0" in lines) is bool(models)
     look = f"colmap gui --database_path '{output}/sgam/database.db' --image_path '{output}/scene/images'"
     look += f" --import_path '{output}/sgam/sparse/0'" if models else ""

@@ -23,6 +23,10 @@ def run(options=None, **inputs):
             run(images={"a.jpg": "1", "c.jpg": "2", "d.jpg": "4"}),
             "images (1 only there, 'b.jpg' for one; 2 only here, 'c.jpg' for one)",
         ),
+        (
+            run({"matcher": "loftr"}, pairs=[]),
+            "--matcher (sift there, loftr here), pairs (1 only there, 'a.jpg b.jpg' for one)",
+        ),
         (run(pairs=[]), "pairs (1 only there, 'a.jpg b.jpg' for one)"),
         (run(), "cameras"),
         (

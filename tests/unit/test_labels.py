@@ -65,6 +65,12 @@ def test_another_size(tmp_path):
     )
 
 
+def test_maps_of_a_run_have_a_size_of_their_own(tmp_path):
+    save(tmp_path, "a.png")
+    (tmp_path / "labels.json").write_text('{"made_from": "0123"}')
+    assert only_result(tmp_path, image_file("a.jpg", 8, 6)).shape == (6, 8)
+
+
 def test_one_failure_leaves_the_others(tmp_path):
     save(tmp_path, "a.png")
     save(tmp_path, "c.png")

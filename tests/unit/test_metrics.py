@@ -295,6 +295,22 @@ def test_alignment_finds_a_known_similarity_in_spite_of_outliers(line, outliers)
         assert errors[f"{i}.jpg"].centre > 1
 
 
+def test_a_turn_about_a_line_that_centres_leave_open_is_no_error_of_cameras():
+    rng = np.random.default_rng(0)
+    true = {name: p.copy() for name, p in cameras(12, line=True).items()}
+    for p in true.values():
+        p[:, 3] += rng.normal(0, 0.15, 3)  # off a line of eleven
+    found = in_another_world(true)
+    for p in found.values():
+        p[:, 3] += rng.normal(0, 0.02, 3)
+    similarity = sfm_metrics.align(found, true)
+    assert similarity is not None
+    errors = sfm_metrics.camera_errors(found, true, similarity)
+    assert max(error.rotation for error in errors.values()) < 1e-3
+    turn = Rotation.from_matrix(similarity.rotation @ SIMILARITY.rotation.T).magnitude()
+    assert np.rad2deg(turn) > 1  # of the centres alone
+
+
 def test_camera_errors_are_in_the_unit_of_the_ground_truth():
     true = cameras(10)
     found = in_another_world(true)

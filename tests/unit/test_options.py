@@ -127,6 +127,12 @@ def test_areas_have_pixels_in_proportion_to_whole_images(size, pixels):
     assert CropOptions(max_crop_pixels=4000).of_shapes(size, (200, 300)).max_crop_pixels == (pixels + 4000) / 2
 
 
+@pytest.mark.parametrize("name", ["area_size", "image_size"])
+def test_crops_have_a_size(name):
+    with pytest.raises(OptionError, match=f"{name} is 0; expected at least 1 pixel"):
+        CropOptions(**{name: 0})
+
+
 def test_no_shape_turns_a_limit_of_pixels_into_none():
     assert CropOptions(max_crop_pixels=0).of_shapes((1, 1), (9, 4)).max_crop_pixels == 0
     assert CropOptions(max_crop_pixels=1).of_shapes((1, 9999), (1, 9999)).max_crop_pixels == 1

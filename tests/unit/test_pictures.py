@@ -341,7 +341,7 @@ class TestCollection:
         assert len(panels(figure)) == 2
         assert {"1 pair, no pose", "failed", "no image", "1 pair, model 1"} <= set(texts(figure))
         assert {"002.jpg: cannot be decoded", "Failed or without a pose: 2", "No verified pair."} <= set(texts(figure))
-        assert "Model 0 has 1 image, model 1 has 1 image; images without a pose: 2." in texts(figure)
+        assert "Model 0 has 1 image, model 1 has 1 image; images without a pose: 1." in texts(figure)
         red = matplotlib.colors.to_rgba("#c62828")
         (nodes,) = drawn(figure, PathCollection)
         assert [tuple(colour) == red for colour in nodes.get_facecolors()] == [True] * 4  # none has a verified pair

@@ -264,6 +264,10 @@ class TestPicturesOfWhatThereIs:
         missing = "keypoints and verified pairs (no database.db); registered images (no model in sparse)"
         assert f"Not in this picture: {missing}." in words
         assert "broken.jpg: cannot be decoded (not an image)" in words
+        inputs = json.loads((out / "inputs.json").read_text())
+        (out / "inputs.json").write_text(json.dumps(inputs | {"left_out": [["a.jpg", "broken.jpg"]]}))
+        words = words_of(collection_picture(open_results(out)))
+        assert "5 images, 1 of them failed; 5 pairs listed, 2 matched, 2 failed." in words
 
     def test_a_run_that_has_just_begun(self, tmp_path, images):
         out = write_run(tmp_path / "out", images, inputs=False, blocks=())

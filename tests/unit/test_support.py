@@ -51,7 +51,7 @@ def test_areas_that_matches_join_stay_and_others_are_skipped_with_the_reason():
     assert judged.confident[0] == judged.doubtful[0][1] == true
     skipped = judged.confident[1]
     assert skipped.state == judged.doubtful[0][0].state == AreaState.SKIPPED
-    assert skipped.reason.endswith("whole-image matches in its first area end in its second one, no more than chance")
+    assert skipped.reason.endswith("whole-image matches lead from area to area: no more than chance")
 
 
 @pytest.mark.parametrize("wrong", [0, 40])
