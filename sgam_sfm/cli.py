@@ -87,11 +87,20 @@ def run(arguments: Sequence[str]) -> int:
         return DONE
     except Exception as error:
         message, code = _explained(error, getattr(getattr(options, "method", options), "output", None))
+        message = _by_flag(message, arguments) if options is None else message
         console.print(f"[red]error:[/red] {escape(message)}", highlight=False, soft_wrap=True)
         return code
     except KeyboardInterrupt:
         console.print("stopped; the same command continues where it was")
         return INTERRUPTED
+
+
+def _by_flag(message: str, arguments: Sequence[str]) -> str:
+    """What is wrong with an option of the algorithm, `max_crop_pixels is -5; ...`, by the flag that was given."""
+    name, rest = message.split(" ", 1) if " " in message else (message, "")
+    flags = [argument.partition("=")[0] for argument in arguments if argument.startswith("--")]
+    given = [flag for flag in flags if flag[2:].rpartition(".")[2].replace("-", "_") == name]
+    return f"{given[-1]} {rest}" if given else message
 
 
 def _parse(arguments: Sequence[str]) -> Any:

@@ -270,6 +270,11 @@ ONE_LINE_ERRORS = {
     "block images": (["--block-images", "0"], "--block-images is 0; expected at least 1"),
     "image size": (["--max-image-size", "-5"], "--max-image-size is -5; expected at least 1"),
     "threads": (["--threads", "-1"], "--threads is -1; expected a number of cores, or 0 for all"),
+    "area size": (["--area-size=0"], "--area-size is 0; expected at least 1 pixel"),
+    "keypoints": (
+        ["--keypoints.cluster-radius-px", "-1"],
+        "--keypoints.cluster-radius-px is -1.0; expected a positive",
+    ),
     "config": (["--config", "{tmp}/c.toml"], "--config '{tmp}/c.toml' does not exist"),
     "a label's name": (
         ["--mask-matches", "sky"],
