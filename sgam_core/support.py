@@ -47,8 +47,7 @@ def _judged(
     area: AreaMatch, matches: Matches, options: GuidanceOptions, frames: tuple[Frame, Frame] | None = None
 ) -> tuple[float, AreaMatch]:
     """The probability of chance, and the area pair with its state. Args: frames: the images of what is to be cut."""
-    inside0, inside1 = area.area0.box.contains(matches.points0), area.area1.box.contains(matches.points1)
-    joined, leaving, arriving = (int(inside.sum()) for inside in (inside0 & inside1, inside0, inside1))
+    joined, leaving, arriving = _counts(area, matches)
     chance = float(hypergeom.sf(joined - 1, len(matches), arriving, leaving)) if joined else 1.0
     if joined >= _FEWEST and max(leaving, arriving) >= _ALL * len(matches):
         chance = options.max_chance  # one image shows the other's area from near: chance tells nothing, overlap may
@@ -56,13 +55,18 @@ def _judged(
         reason = f"{joined} of {leaving} whole-image matches lead from area to area: no more than chance"
         return chance, _skipped(area, reason)
     if frames is not None and joined >= max(options.min_matches, 1):
-        area = _cut(area, matches.select(inside0 & inside1), frames, options)
-        inside0, inside1 = area.area0.box.contains(matches.points0), area.area1.box.contains(matches.points1)
-    joined, leaving, arriving = (int(inside.sum()) for inside in (inside0 & inside1, inside0, inside1))
+        area = _cut(area, matches.select(area.joins(matches)), frames, options)
+        joined, leaving, arriving = _counts(area, matches)
     if joined < options.min_overlap * max(leaving, arriving):
         reason = f"its areas share {joined} of {leaving} and {arriving} whole-image matches: they overlap in part"
         return chance, _skipped(area, reason)
     return chance, area
+
+
+def _counts(area: AreaMatch, matches: Matches) -> tuple[int, int, int]:
+    """Matches in both areas, in the first one and in the second one."""
+    inside0, inside1 = area.area0.box.contains(matches.points0), area.area1.box.contains(matches.points1)
+    return int((inside0 & inside1).sum()), int(inside0.sum()), int(inside1.sum())
 
 
 def _cut(area: AreaMatch, shared: Matches, frames: tuple[Frame, Frame], options: GuidanceOptions) -> AreaMatch:

@@ -97,7 +97,7 @@ def run(arguments: Sequence[str]) -> int:
 
 def _by_flag(message: str, arguments: Sequence[str]) -> str:
     """What is wrong with an option of the algorithm, `max_crop_pixels is -5; ...`, by the flag that was given."""
-    name, rest = message.split(" ", 1) if " " in message else (message, "")
+    name, _, rest = message.partition(" ")
     flags = [argument.partition("=")[0] for argument in arguments if argument.startswith("--")]
     given = [flag for flag in flags if flag[2:].rpartition(".")[2].replace("-", "_") == name]
     return f"{given[-1]} {rest}" if given else message
