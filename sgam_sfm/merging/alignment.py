@@ -48,11 +48,11 @@ def offsets_of(points: np.ndarray, index: np.ndarray, matches: np.ndarray, affin
     """
     result = np.empty((len(index), 2))
     for row in range(len(index)):
-        x = points[index[row, 0], 0] - matches[row, 0]
-        y = points[index[row, 0], 1] - matches[row, 1]
+        one, other = points[index[row, 0]], points[index[row, 1]]
+        x, y = np.float64(one[0]) - matches[row, 0], np.float64(one[1]) - matches[row, 1]
         for axis in range(2):
             carried = affine[row, 2 * axis] * x + affine[row, 2 * axis + 1] * y
-            result[row, axis] = points[index[row, 1], axis] - matches[row, 2 + axis] - carried
+            result[row, axis] = np.float64(other[axis]) - matches[row, 2 + axis] - carried
     return result
 
 

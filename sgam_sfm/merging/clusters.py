@@ -9,7 +9,7 @@ from sgam_sfm.merging.compiled import compiled
 from sgam_sfm.merging.grid import cells_around, grid_of, nearest
 from sgam_sfm.merging.sorting import stable_order
 
-_CELLS_A_RADIUS = 8  # points of a matcher's grid coincide: one spot a fine cell keeps the number of neighbours small
+_CELLS_A_RADIUS = 8  # points of a matcher's grid coincide: a spot each keeps the number of neighbours small
 
 
 def merge_image(
@@ -56,63 +56,97 @@ def _cluster(points: np.ndarray, weights: np.ndarray, radius: float) -> tuple[np
     """Means (N, 2) of the clusters around the densest points, and the cluster of every point."""
     if not len(points):
         return np.zeros((0, 2)), np.zeros(0, np.int64)
-    spot_of = _fine_cells(points, radius / _CELLS_A_RADIUS)
-    spots, spot_weights = _means(spot_of, points, weights, spot_of.max() + 1)
-    frame, start, order = grid_of(spots, radius)
-    density = _density(spots, spot_weights, frame, start, order, radius)
-    seeds = spots[_seeds(spots, stable_order(-density), frame, start, order, radius)]
-    labels = _nearest_of(seeds, spots, radius * (1 + 1e-9))[spot_of]
-    means, _ = _means(labels, points, weights, len(seeds))
+    spot_of, spots, frame, start = _spots(points, weights, radius)
+    densest = stable_order(-_density(spots, frame, start, radius))
+    seed_of, count = _nearest_seeds(spots, densest, frame, start, radius)
+    labels = seed_of[spot_of]
+    means, _ = _means(labels, points, weights, count)
     return means, labels
 
 
-def _fine_cells(points: np.ndarray, width: float) -> np.ndarray:
-    """The cell of every point (M,), numbered 0, 1, ... without gaps."""
-    columns, rows = np.floor(points / width + 0.5).astype(np.int64).T
-    keys = columns * (rows.max() - rows.min() + 1) + (rows - rows.min())
-    order = stable_order(keys)
-    cells = np.empty(len(points), np.int64)
-    cells[order] = np.cumsum(np.diff(keys[order], prepend=keys[order[:1]]) != 0)
-    return cells
+@compiled
+def _spots(
+    points: np.ndarray, weights: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The spot of every point (M,); place and weight of the spots (S, 3), sorted into a grid: its frame and start."""
+    frame, start, order = grid_of(points, radius)
+    spot_of, spots = np.empty(len(points), np.int64), np.zeros((len(points), 3))
+    fine = np.empty((len(points), 2), np.int64)
+    count = 0
+    for cell in range(len(start) - 1):
+        begin, first = start[cell], count
+        start[cell] = first
+        for place in range(begin, start[cell + 1]):
+            row = order[place]
+            column = int(np.floor(points[row, 0] * (_CELLS_A_RADIUS / radius) + 0.5))
+            line = int(np.floor(points[row, 1] * (_CELLS_A_RADIUS / radius) + 0.5))
+            spot = first
+            while spot < count and (fine[spot, 0] != column or fine[spot, 1] != line):
+                spot += 1
+            if spot == count:
+                fine[count, 0], fine[count, 1] = column, line
+                count += 1
+            spot_of[row] = spot
+            spots[spot, 0] += weights[row] * points[row, 0]
+            spots[spot, 1] += weights[row] * points[row, 1]
+            spots[spot, 2] += weights[row]
+    start[len(start) - 1] = count
+    for spot in range(count):
+        spots[spot, :2] /= spots[spot, 2]
+    return spot_of, spots[:count], frame, start
 
 
 @compiled
-def _density(
-    spots: np.ndarray, weights: np.ndarray, frame: np.ndarray, start: np.ndarray, order: np.ndarray, radius: float
-) -> np.ndarray:
+def _density(spots: np.ndarray, frame: np.ndarray, start: np.ndarray, radius: float) -> np.ndarray:
     """The sum of weights within a radius of every spot."""
     rows = int(frame[4])
     density = np.zeros(len(spots))
     for spot in range(len(spots)):
         left, right, top, bottom = cells_around(frame, spots[spot, 0], spots[spot, 1], radius)
         for column in range(left, right):
-            for place in range(start[column * rows + top], start[column * rows + bottom]):
-                other = order[place]
+            for other in range(start[column * rows + top], start[column * rows + bottom]):
                 step_x, step_y = spots[other, 0] - spots[spot, 0], spots[other, 1] - spots[spot, 1]
                 if step_x * step_x + step_y * step_y <= radius * radius:
-                    density[spot] += weights[other]
+                    density[spot] += spots[other, 2]
     return density
 
 
 @compiled
-def _seeds(
-    spots: np.ndarray, wanted: np.ndarray, frame: np.ndarray, start: np.ndarray, order: np.ndarray, radius: float
-) -> np.ndarray:
-    """Which spots become seeds: one after the other as `wanted`, unless it is within the radius of one."""
+def _nearest_seeds(
+    spots: np.ndarray, wanted: np.ndarray, frame: np.ndarray, start: np.ndarray, radius: float
+) -> tuple[np.ndarray, int]:
+    """The seed nearest to every spot, and the number of seeds.
+
+    Spots become seeds one after the other as `wanted`, unless one is within the radius; so all have one in reach.
+    """
     rows = int(frame[4])
-    closed, chosen = np.zeros(len(spots), np.bool_), np.zeros(len(spots), np.bool_)
+    closed, seeds = np.zeros(len(spots), np.bool_), np.full(len(spots), -1)
     for spot in wanted:
         if closed[spot]:
             continue
-        chosen[spot] = True
+        seeds[spot] = 0
         left, right, top, bottom = cells_around(frame, spots[spot, 0], spots[spot, 1], radius)
         for column in range(left, right):
-            for place in range(start[column * rows + top], start[column * rows + bottom]):
-                other = order[place]
+            for other in range(start[column * rows + top], start[column * rows + bottom]):
                 step_x, step_y = spots[other, 0] - spots[spot, 0], spots[other, 1] - spots[spot, 1]
                 if step_x * step_x + step_y * step_y <= radius * radius:
                     closed[other] = True
-    return chosen
+    count = 0
+    for spot in range(len(spots)):
+        if seeds[spot] == 0:
+            seeds[spot] = count
+            count += 1
+    nearest_seeds = np.empty(len(spots), np.int64)
+    for spot in range(len(spots)):
+        best = np.inf
+        left, right, top, bottom = cells_around(frame, spots[spot, 0], spots[spot, 1], radius)
+        for column in range(left, right):
+            for other in range(start[column * rows + top], start[column * rows + bottom]):
+                step_x, step_y = spots[other, 0] - spots[spot, 0], spots[other, 1] - spots[spot, 1]
+                squared = step_x * step_x + step_y * step_y
+                if seeds[other] >= 0 and squared < best:
+                    best, nearest_seeds[spot] = squared, seeds[other]
+    return nearest_seeds, count
 
 
 @compiled

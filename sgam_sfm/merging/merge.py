@@ -41,9 +41,9 @@ from sgam_sfm.merging.clusters import finest_and_weight, merge_image
 from sgam_sfm.merging.compiled import compiled
 from sgam_sfm.merging.keypoints import CollectionKeypoints, KeypointOptions
 from sgam_sfm.merging.linking import side_by_side, strongest_first
-from sgam_sfm.merging.raw import SCORE, PairRows, RawMatches, RawPair, batches_of, collect, weights_of
+from sgam_sfm.merging.raw import SCORE, PairRows, RawMatches, RawPair, batches_of, collect, ends_of, weights_of
 from sgam_sfm.merging.scratch import Rows, Scratch
-from sgam_sfm.merging.settling import Photos, agreeing, align, linked, measure_again
+from sgam_sfm.merging.settling import Photos, agreeing, align, measure_again
 from sgam_sfm.merging.tracks import Tracks
 from sgam_sfm.pairs import Pair
 from sgam_sfm.threads import in_order
@@ -153,10 +153,10 @@ def _merge_images(raw: RawMatches, radius_px: float, scratch: Scratch) -> tuple[
         sides[pair.image1].append((1, pair.begin, pair.length))
 
     def keypoints_of(image: int) -> tuple[int, np.ndarray, np.ndarray]:
-        parts = [(side, raw.rows.read(begin, count)) for side, begin, count in sides[image]]
-        points = np.concatenate([rows[:, 2 * side : 2 * side + 2] for side, rows in parts])
-        sigmas = np.concatenate([rows[:, 4 + side] for side, rows in parts])
-        weights = np.concatenate([weights_of(rows) for _, rows in parts])
+        rows = raw.rows.read_parts([(begin, count) for _, begin, count in sides[image]])
+        second = np.repeat([side == 1 for side, _, _ in sides[image]], [count for _, _, count in sides[image]])
+        points = np.where(second[:, None], rows[:, 2:4], rows[:, 0:2])
+        sigmas, weights = np.where(second, rows[:, 5], rows[:, 4]), weights_of(rows)
         merged, labels = merge_image(points, sigmas, weights, radius_px)
         finest = finest_and_weight(labels, sigmas, weights, len(merged), _OCTAVE)
         return image, np.column_stack([merged, *finest]), labels
@@ -184,26 +184,22 @@ def _export(
 ) -> CollectionKeypoints:
     """Keep the matches that agree with their keypoints, and number the keypoints that they use."""
 
-    def found_in(batch: list[PairRows]) -> list[tuple[np.ndarray, np.ndarray, int]]:
-        found = []
-        for pair in batch:
-            kept, index, _ = linked(raw, tracks, pair)
-            rows = raw.rows.read(pair.begin, pair.length)[kept]
-            agree = agreeing(tracks, index, rows, max_residual_sigmas)
-            index, rows = index[agree], rows[agree]
-            found.append((*_best_of(index, rows[:, SCORE]), len(index)))
-        return found
+    def found_in(batch: list[PairRows]) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+        kept, index, _ = tracks.linked(raw.index_of(batch))
+        rows = raw.rows_of(batch)[kept]
+        agree = np.flatnonzero(agreeing(tracks, index, rows, max_residual_sigmas))
+        ends = np.searchsorted(kept[agree], ends_of(batch))
+        return *_best_of(index[agree], rows[agree, SCORE], ends), len(agree)
 
     matches, scores = scratch.rows("merged_matches.rows", 2, np.int32), scratch.rows("scores.rows", 1, np.float32)
     begins = [0]
     num_agreeing = 0
-    for found in in_order(found_in, batches_of(raw)):
-        for index, best, count in found:
-            tracks.mark_used(index)
-            num_agreeing += count
-            begins.append(begins[-1] + len(best))
-        matches.append(np.concatenate([index for index, _, _ in found]))
-        scores.append(np.concatenate([best for _, best, _ in found])[:, None])
+    for index, best, ends, count in in_order(found_in, batches_of(raw)):
+        tracks.mark_used(index)
+        num_agreeing += count
+        begins += (begins[-1] + ends).tolist()
+        matches.append(index)
+        scores.append(best[:, None])
     keypoints, first = scratch.rows("keypoints.rows", 2, np.float32), [0]
     for begin, end in pairwise(bounds.tolist()):
         keypoints.append(tracks.points(tracks.number_used(begin, end)))
@@ -236,16 +232,21 @@ def _export(
 
 
 @compiled
-def _best_of(index: np.ndarray, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The different matches (E, 2) of keypoints, sorted, and the best score of each."""
-    keys = (index[:, 0] << 32) | index[:, 1]
-    order = np.argsort(keys, kind="mergesort")
-    edges, best = np.empty((len(keys), 2), np.int32), np.zeros(len(keys), np.float32)
-    count = 0
-    for place in range(len(order)):
-        row = order[place]
-        if place == 0 or keys[row] != keys[order[place - 1]]:
-            edges[count, 0], edges[count, 1] = index[row, 0], index[row, 1]
-            count += 1
-        best[count - 1] = max(best[count - 1], scores[row])
-    return edges[:count], best[:count]
+def _best_of(index: np.ndarray, scores: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The different matches (E, 2) of keypoints, sorted in every pair, the best score of each, and the pairs' ends.
+
+    Args: ends: of the matches of every pair.
+    """
+    edges, best = np.empty((len(index), 2), np.int32), np.zeros(len(index), np.float32)
+    ends_found, count, begin = np.empty(len(ends), np.int64), 0, 0
+    for pair, end in enumerate(ends):
+        keys = (index[begin:end, 0] << 32) | index[begin:end, 1]
+        order = np.argsort(keys, kind="mergesort")
+        for place in range(len(order)):
+            row = begin + order[place]
+            if place == 0 or keys[order[place]] != keys[order[place - 1]]:
+                edges[count, 0], edges[count, 1] = index[row, 0], index[row, 1]
+                count += 1
+            best[count - 1] = max(best[count - 1], scores[row])
+        ends_found[pair], begin = count, end
+    return edges[:count], best[:count], ends_found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,7 +10,8 @@ import numpy as np
 
 from sgam_core.errors import InputError, ShapeError
 from sgam_core.types import Matches
-from sgam_sfm.merging.affine import local_affine
+from sgam_sfm.merging.affine import affine_maps
+from sgam_sfm.merging.compiled import compiled
 from sgam_sfm.merging.scratch import Rows, Scratch, batches
 from sgam_sfm.pairs import Pair
 from sgam_sfm.threads import in_order
@@ -47,9 +48,14 @@ class RawMatches:
     rows: Rows
     index: tuple[Rows, Rows]
 
-    def index_of(self, pair: PairRows) -> np.ndarray:
-        """(M, 2) keypoints of a pair's matches."""
-        return np.concatenate([side.read(pair.begin, pair.length) for side in self.index], axis=1)
+    def rows_of(self, pairs: Sequence[PairRows]) -> np.ndarray:
+        """The matches of some pairs, one after the other."""
+        return self.rows.read_parts([(pair.begin, pair.length) for pair in pairs])
+
+    def index_of(self, pairs: Sequence[PairRows]) -> np.ndarray:
+        """(M, 2) keypoints of the matches of some pairs, one after the other."""
+        parts = [(pair.begin, pair.length) for pair in pairs]
+        return np.concatenate([side.read_parts(parts) for side in self.index], axis=1)
 
 
 def collect(pairs: Iterable[RawPair], scratch: Scratch) -> RawMatches:
@@ -60,11 +66,14 @@ def collect(pairs: Iterable[RawPair], scratch: Scratch) -> RawMatches:
     """
     rows = scratch.rows("matches.rows", _WIDTH, np.float32)
     found: dict[Pair, tuple[Pair, int, int]] = {}
-    for pair, part in in_order(_rows_of, pairs):
-        key = (min(pair), max(pair))
-        if key in found:
-            raise InputError(f"the pair of '{key[0]}' and '{key[1]}' comes in both orders; keep one of them")
-        found[key] = (pair, rows.count, len(part))
+    for told, part in in_order(_rows_of, batches(pairs, lambda raw: len(raw[1]), _AT_ONCE)):
+        begin = rows.count
+        for pair, count in told:
+            key = (min(pair), max(pair))
+            if key in found:
+                raise InputError(f"the pair of '{key[0]}' and '{key[1]}' comes in both orders; keep one of them")
+            found[key] = (pair, begin, count)
+            begin += count
         rows.append(part)
     names = sorted({name for key in found for name in key})
     row_of = {name: row for row, name in enumerate(names)}
@@ -77,31 +86,51 @@ def collect(pairs: Iterable[RawPair], scratch: Scratch) -> RawMatches:
     )
 
 
-def _rows_of(raw: RawPair) -> tuple[Pair, np.ndarray]:
-    """The matches of a pair as they are kept."""
-    pair, matches, mask = raw
-    if pair[0] == pair[1]:
-        raise InputError(f"pair ('{pair[0]}', '{pair[1]}') matches an image with itself; remove it from the pairs")
-    mask = np.ones(len(matches), bool) if mask is None else mask
-    if mask.shape != (len(matches),) or mask.dtype != np.bool_:
-        raise ShapeError(
-            f"inliers of pair {pair} are {mask.dtype} {mask.shape}; expected bool ({len(matches)},), one per match"
-        )
-    matches = matches if pair[0] < pair[1] else matches.swapped()
-    rows = np.empty((len(matches), _WIDTH), np.float32)
-    rows[:, 0:2], rows[:, 2:4] = matches.points0, matches.points1
-    rows[:, 4], rows[:, 5], rows[:, SCORE] = matches.sigmas0, matches.sigmas1, matches.scores
-    affine = local_affine(matches.points0, matches.points1, mask).reshape(-1, 4)
-    rows[:, AFFINE] = affine
-    determinant = affine[:, 0] * affine[:, 3] - affine[:, 1] * affine[:, 2]
-    variances = matches.sigmas1.astype(np.float64) ** 2 + np.abs(determinant) * matches.sigmas0**2
-    rows[:, VARIANCE] = np.where(mask, variances, -variances)
-    return pair, rows
+def _rows_of(batch: list[RawPair]) -> tuple[list[tuple[Pair, int]], np.ndarray]:
+    """Some pairs with the number of their matches, and these as they are kept."""
+    masks = [np.ones(len(matches), bool) if mask is None else mask for _, matches, mask in batch]
+    for (pair, matches, _), mask in zip(batch, masks, strict=True):
+        if pair[0] == pair[1]:
+            raise InputError(f"pair ('{pair[0]}', '{pair[1]}') matches an image with itself; remove it from the pairs")
+        if mask.shape != (len(matches),) or mask.dtype != np.bool_:
+            raise ShapeError(
+                f"inliers of pair {pair} are {mask.dtype} {mask.shape}; expected bool ({len(matches)},), one per match"
+            )
+    told = [(pair, len(matches)) for pair, matches, _ in batch]
+    joined = Matches.concatenate([m if pair[0] < pair[1] else m.swapped() for pair, m, _ in batch])
+    rows = np.empty((len(joined), _WIDTH), np.float32)
+    rows[:, 0:2], rows[:, 2:4] = joined.points0, joined.points1
+    rows[:, 4], rows[:, 5], rows[:, SCORE] = joined.sigmas0, joined.sigmas1, joined.scores
+    ends = np.cumsum([count for _, count in told])
+    _add_maps(rows, joined.points0, joined.points1, np.concatenate(masks), ends)
+    return told, rows
+
+
+@compiled
+def _add_maps(
+    rows: np.ndarray, points0: np.ndarray, points1: np.ndarray, trusted: np.ndarray, ends: np.ndarray
+) -> None:
+    """Fill in the local maps of matches, pair by pair, and the variances that follow."""
+    begin = 0
+    for end in ends:
+        maps = affine_maps(points0[begin:end], points1[begin:end], trusted[begin:end])
+        rows[begin:end, 8:12] = maps
+        for row in range(begin, end):
+            a, b, c, d = maps[row - begin]
+            sigma0, sigma1 = np.float64(rows[row, 4]), np.float64(rows[row, 5])
+            variance = sigma1**2 + abs(a * d - b * c) * sigma0**2
+            rows[row, 7] = variance if trusted[row] else -variance
+        begin = end
 
 
 def weights_of(rows: np.ndarray) -> np.ndarray:
     """What matches count by, above 0."""
     return np.maximum(rows[:, SCORE], np.float32(_MIN_WEIGHT))
+
+
+def ends_of(pairs: Sequence[PairRows]) -> np.ndarray:
+    """Where the matches of every pair end, one after the other."""
+    return np.cumsum([pair.length for pair in pairs])
 
 
 def batches_of(raw: RawMatches) -> Iterator[list[PairRows]]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from threading import Lock
 from typing import TypeVar
@@ -61,18 +60,25 @@ class Rows:
 
     def write(self, begin: int, rows: np.ndarray) -> None:
         """Put rows (n, width) from a row on."""
-        data = np.ascontiguousarray(rows, self._dtype).tobytes()
+        data = np.ascontiguousarray(rows, self._dtype)
         with self._lock:
             self._file.seek(begin * self._row_bytes)
-            self._file.write(data)
+            self._file.write(data.data)
         self.count = max(self.count, begin + len(rows))
 
     def read(self, begin: int, count: int) -> np.ndarray:
         """The rows (count, width) from a row on."""
-        rows = np.empty((count, self._width), self._dtype)
+        return self.read_parts([(begin, count)])
+
+    def read_parts(self, parts: Sequence[tuple[int, int]]) -> np.ndarray:
+        """The same of several parts (begin, count), one after the other."""
+        rows = np.empty((sum(count for _, count in parts), self._width), self._dtype)
+        place = 0
         with self._lock:
-            self._file.seek(begin * self._row_bytes)
-            self._file.readinto(rows.data)
+            for begin, count in parts:
+                self._file.seek(begin * self._row_bytes)
+                self._file.readinto(rows[place : place + count].data)
+                place += count
         return rows
 
     def close(self) -> None:
@@ -86,7 +92,7 @@ class Sorted:
     def __init__(self, folder: Path, width: int, dtype: type[np.generic]) -> None:
         folder.mkdir(exist_ok=True)
         self._folder, self._width, self._dtype = folder, width, np.dtype(dtype)
-        self._waiting: dict[int, list[np.ndarray]] = defaultdict(list)
+        self._waiting: list[tuple[np.ndarray, np.ndarray]] = []
         self._bytes = 0
         self.labels: set[int] = set()
 
@@ -94,11 +100,7 @@ class Sorted:
         """Add rows (n, width) under labels (n,)."""
         if not len(rows):
             return
-        order = stable_order(labels)
-        labels, rows = labels[order], np.ascontiguousarray(rows[order], self._dtype)
-        begins = np.flatnonzero(np.diff(labels, prepend=labels[:1] - 1))
-        for label, part in zip(labels[begins].tolist(), np.split(rows, begins[1:]), strict=True):
-            self._waiting[label].append(part.copy())
+        self._waiting.append((labels, np.ascontiguousarray(rows, self._dtype)))
         self._bytes += rows.nbytes
         if self._bytes > _BUFFERED:
             self._flush()
@@ -124,13 +126,17 @@ class Sorted:
         return sorted(self.labels)
 
     def _flush(self) -> None:
-        for label, parts in self._waiting.items():
+        if not self._waiting:
+            return
+        labels, rows = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
+        self._waiting, self._bytes = [], 0
+        order = stable_order(labels)
+        labels, rows = labels[order], rows[order]
+        begins = np.flatnonzero(np.diff(labels, prepend=labels[:1] - 1))
+        for label, part in zip(labels[begins].tolist(), np.split(rows, begins[1:]), strict=True):
             with self._path(label).open("ab") as file:
-                for part in parts:
-                    part.tofile(file)
+                part.tofile(file)
             self.labels.add(label)
-        self._waiting.clear()
-        self._bytes = 0
 
     def _path(self, label: int) -> Path:
         return self._folder / f"{label}.rows"

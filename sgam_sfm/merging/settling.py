@@ -8,7 +8,6 @@ import numpy as np
 
 from sgam_sfm.matchers.subpixel import refine
 from sgam_sfm.merging.affine import local_affine
-from sgam_sfm.merging.alignment import offsets_of
 from sgam_sfm.merging.raw import (
     AFFINE,
     POINTS,
@@ -32,14 +31,6 @@ Photos = Callable[[str], np.ndarray]
 """The gray values (H, W) of an image, uint8, by its name; threads may ask."""
 
 
-def linked(raw: RawMatches, tracks: Tracks, pair: PairRows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The matches of a pair that lie in one track: rows in the pair, keypoints (M, 2), track of each."""
-    index = raw.index_of(pair)
-    root = tracks.track(index.ravel()).reshape(-1, 2)
-    kept = np.flatnonzero(root[:, 0] == root[:, 1])
-    return kept, tracks.representative(index[kept].ravel()).reshape(-1, 2), root[kept, 0]
-
-
 def align(raw: RawMatches, tracks: Tracks, scratch: Scratch) -> int:
     """Move the keypoints to where their matches agree. Returns: the matches that are in no track."""
     num_matches, num_linked = sum(pair.length for pair in raw.pairs), 0
@@ -47,18 +38,14 @@ def align(raw: RawMatches, tracks: Tracks, scratch: Scratch) -> int:
     num_parts = np.uint64(1 + num_matches // ROWS_A_PART)
 
     def equations(batch: list[PairRows]) -> tuple[np.ndarray, np.ndarray]:
-        found, roots = [], []
-        for pair in batch:
-            kept, index, root = linked(raw, tracks, pair)
-            rows = raw.rows.read(pair.begin, pair.length)[kept]
-            made = np.empty((len(kept), 10), np.float32)
-            made.view(np.int32)[:, 0:2], made.view(np.int32)[:, 2] = index, root
-            made[:, 3:7] = rows[:, AFFINE]
-            made[:, 7] = weights_of(rows) / np.abs(rows[:, VARIANCE])
-            made[:, 8:10] = _offsets(tracks, index, rows)
-            found.append(made)
-            roots.append(root)
-        return np.concatenate(found), np.concatenate(roots)
+        kept, index, roots = tracks.linked(raw.index_of(batch))
+        rows = raw.rows_of(batch)[kept]
+        made = np.empty((len(kept), 10), np.float32)
+        made.view(np.int32)[:, 0:2], made.view(np.int32)[:, 2] = index, roots
+        made[:, 3:7] = rows[:, AFFINE]
+        made[:, 7] = weights_of(rows) / np.abs(rows[:, VARIANCE])
+        made[:, 8:10] = tracks.offsets(index, rows[:, POINTS], rows[:, AFFINE])
+        return made, roots
 
     for rows, roots in in_order(equations, batches_of(raw)):
         # A multiplicative hash: roots crowd where images do.
@@ -83,8 +70,8 @@ def measure_again(raw: RawMatches, tracks: Tracks, photos: Photos, max_residual_
     """
 
     def of_pair(pair: PairRows) -> None:
-        kept, index, _ = linked(raw, tracks, pair)
-        rows = raw.rows.read(pair.begin, pair.length)
+        kept, index, _ = tracks.linked(raw.index_of([pair]))
+        rows = raw.rows_of([pair])
         part = rows[kept]
         agree = agreeing(tracks, index, part, max_residual_sigmas)
         kept, part = kept[agree], part[agree]
@@ -110,11 +97,5 @@ def measure_again(raw: RawMatches, tracks: Tracks, photos: Photos, max_residual_
 
 def agreeing(tracks: Tracks, index: np.ndarray, rows: np.ndarray, max_residual_sigmas: float) -> np.ndarray:
     """Which matches lie where their keypoints say; none whose keypoint lies nowhere."""
-    error = np.linalg.norm(_offsets(tracks, index, rows), axis=1)
+    error = np.linalg.norm(tracks.offsets(index, rows[:, POINTS], rows[:, AFFINE]), axis=1)
     return error <= (max_residual_sigmas or np.inf) * np.sqrt(np.abs(rows[:, VARIANCE]))
-
-
-def _offsets(tracks: Tracks, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    points = tracks.points(index.ravel())
-    places = np.arange(2 * len(index)).reshape(-1, 2)
-    return offsets_of(points, places, rows[:, POINTS], rows[:, AFFINE])

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterable
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int, Int32
 
 from sgam_core.types import Box
-from sgam_sfm.merging.alignment import align_keypoints
+from sgam_sfm.merging.alignment import align_keypoints, offsets_of
 from sgam_sfm.merging.compiled import compiled
 from sgam_sfm.merging.grid import cells_around, grid_of
 
@@ -70,6 +70,16 @@ class Tracks:
     def representative(self, keypoints: np.ndarray | None = None) -> Int[np.ndarray, " K"]:
         """The keypoint of the same image and track that each has become part of, itself for most."""
         return _standing(self._rows, np.arange(len(self._rows)) if keypoints is None else keypoints)
+
+    def linked(self, index: Int[np.ndarray, "M 2"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The matches whose keypoints are in one track: their rows, standing keypoints (L, 2), track of each."""
+        return _linked(self._rows, index)
+
+    def offsets(
+        self, index: Int[np.ndarray, "M 2"], matches: Float[np.ndarray, "M 4"], affine: Float[np.ndarray, "M 4"]
+    ) -> Float[np.ndarray, "M 2"]:
+        """How far keypoints lie from where their matches put them, see `offsets_of`."""
+        return offsets_of(self._values[:, _X : _Y + 1], index, matches, affine)
 
     def points(self, keypoints: np.ndarray | slice) -> Float[np.ndarray, "K 2"]:
         """Where keypoints lie."""
@@ -142,7 +152,7 @@ class Tracks:
         """The numbers of used keypoints in their images."""
         return self._rows[keypoints, _LINK]
 
-    def side_by_side(self, begin: int, end: int) -> tuple[Int[np.ndarray, "T 2"], Float[np.ndarray, " T"]]:
+    def side_by_side(self, begin: int, end: int) -> tuple[Int32[np.ndarray, "T 2"], Float32[np.ndarray, " T"]]:
         """Pairs of tracks, smaller number first, with keypoints of one image within the radius, and their distances.
 
         begin, end: the keypoints of the image. Distances are in units of the radius.
@@ -186,6 +196,23 @@ def _standing(rows: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
     for place in range(len(keypoints)):
         found[place] = _stands(rows, keypoints[place])
     return found
+
+
+@compiled
+def _linked(rows: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    kept, standing = np.empty(len(index), np.int64), np.empty((len(index), 2), np.int64)
+    tracks, count = np.empty(len(index), np.int64), 0
+    for row in range(len(index)):
+        root, other = np.int64(index[row, 0]), np.int64(index[row, 1])
+        while rows[root, _PARENT] >= 0:
+            root = rows[root, _PARENT]
+        while rows[other, _PARENT] >= 0:
+            other = rows[other, _PARENT]
+        if root == other:
+            kept[count], tracks[count] = row, root
+            standing[count, 0], standing[count, 1] = _stands(rows, index[row, 0]), _stands(rows, index[row, 1])
+            count += 1
+    return kept[:count], standing[:count], tracks[:count]
 
 
 @compiled
@@ -266,9 +293,14 @@ def _join(
             member = rows[member, _LINK]
             if member == entry:
                 break
-        if fine and shared >= min_shared:
+        if not fine or shared < min_shared:
+            continue
+        if shared:
             rows[kept, _PARENT] = -_one_ring(rows, values, stamps, edge, entry, first)
-            rows[gone, _PARENT] = kept
+        else:
+            rows[entry, _LINK], rows[first, _LINK] = rows[first, _LINK], rows[entry, _LINK]
+            rows[kept, _PARENT] += rows[gone, _PARENT]
+        rows[gone, _PARENT] = kept
 
 
 @compiled
@@ -347,7 +379,7 @@ def _near_tracks(
     widest = radius * coarsest
     frame, start, order = grid_of(points, widest / 2)
     lines = int(frame[4])
-    pairs, distances = np.empty((64, 2), np.int64), np.empty(64)
+    pairs, distances = np.empty((64, 2), np.int32), np.empty(64, np.float32)
     count = 0
     for one in range(len(points)):
         left, right, top, bottom = cells_around(frame, points[one, 0], points[one, 1], widest)
