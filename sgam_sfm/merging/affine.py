@@ -11,6 +11,8 @@ _A_CELL = 2.0  # matches that a cell has on average; its map is fitted to those 
 _ROUNDS = 2  # of reweighting: more change nothing
 _PULL = 0.25  # matches that the map of the whole pair counts for in that of a cell
 _LEAST_SPREAD = 0.01  # of a cell's size, squared: matches on one spot tell no map
+_EXACT = 1e-3  # of a cell's width: no residual counts as smaller
+_MAP = 6  # numbers of a map: its linear part row by row, then its offset
 _MOMENTS = 12
 
 
@@ -26,62 +28,72 @@ def local_affine(
     Args: points of one pair's matches, pixels. trusted: which may be fitted to; outliers among them weigh less.
     Returns: (M, 2, 2) Jacobians of the map from image 0 to image 1.
     """
-    return affine_maps(points0, points1, trusted).reshape(-1, 2, 2)
+    maps = np.empty((len(points0), 4))
+    fit_maps(points0, points1, trusted, 0, len(points0), maps)
+    return maps.reshape(-1, 2, 2)
 
 
 @compiled
-def affine_maps(points0: np.ndarray, points1: np.ndarray, trusted: np.ndarray) -> np.ndarray:
-    """`local_affine`, row by row (M, 4)."""
-    maps = np.empty((len(points0), 4))
-    base0, base1 = points0[trusted], points1[trusted]
-    count = len(base0)
+def fit_maps(
+    points0: np.ndarray, points1: np.ndarray, trusted: np.ndarray, begin: int, end: int, maps: np.ndarray
+) -> None:
+    """`local_affine` of one pair, whose matches are the rows from `begin` to `end` of all arrays; fills in its maps."""
+    count, low_x, low_y, high_x, high_y = 0, np.inf, np.inf, -np.inf, -np.inf
+    for row in range(begin, end):
+        if trusted[row]:
+            count += 1
+            low_x, high_x = min(low_x, points0[row, 0]), max(high_x, points0[row, 0])
+            low_y, high_y = min(low_y, points0[row, 1]), max(high_y, points0[row, 1])
     if count < 4:
-        for row in range(len(maps)):
-            maps[row] = (1.0, 0.0, 0.0, 1.0)
-        return maps
-    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
-    for row in range(count):
-        low_x, high_x = min(low_x, base0[row, 0]), max(high_x, base0[row, 0])
-        low_y, high_y = min(low_y, base0[row, 1]), max(high_y, base0[row, 1])
+        for row in range(begin, end):
+            maps[row, 0] = maps[row, 3] = 1.0
+            maps[row, 1] = maps[row, 2] = 0.0
+        return
     wide, high = high_x - low_x, high_y - low_y
     width = max(np.sqrt(_A_CELL * wide * high / count), _A_CELL * (wide + high) / (count + 1), 1e-9)
     columns, rows = int(wide / width) + 1, int(high / width) + 1
-    # About the middle, where sums of squares lose least.
-    middle_u, middle_v = base1[:, 0].mean(), base1[:, 1].mean()
-    steps, cells = np.empty((count, 4)), np.empty(count, np.int64)
-    for row in range(count):
-        x, y = base0[row, 0] - low_x, base0[row, 1] - low_y
-        steps[row] = (x - wide / 2, y - high / 2, base1[row, 0] - middle_u, base1[row, 1] - middle_v)
-        cells[row] = int(x / width) * rows + int(y / width)
 
-    weights = np.ones(count)
-    least, number = _LEAST_SPREAD * width**2, np.full(1, float(count))
-    whole = np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
-    everywhere = np.zeros(count, np.int64)
+    base, weights = np.empty((count, 4)), np.ones(count)
+    cells, everywhere = np.empty(count, np.int64), np.zeros(count, np.int64)
+    near, one = np.zeros((columns * rows, 1)), np.full((1, 1), float(count))
+    place = 0
+    for row in range(begin, end):
+        if trusted[row]:
+            base[place, 0], base[place, 1] = points0[row, 0] - low_x, points0[row, 1] - low_y
+            base[place, 2], base[place, 3] = points1[row, 0], points1[row, 1]
+            cells[place] = int(base[place, 0] / width) * rows + int(base[place, 1] / width)
+            near[cells[place], 0] += 1
+            place += 1
+    _add_neighbours(near, columns, rows)
+
+    least, exact = _LEAST_SPREAD * width**2, (_EXACT * width) ** 2
+    whole, same = np.empty((1, _MAP)), np.array([1.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    sums, fits = np.empty((columns * rows, _MOMENTS)), np.empty((columns * rows, _MAP))
     for _ in range(_ROUNDS + 1):
-        _fit(_sums(steps, weights, everywhere, 1), number, np.array([1.0, 0.0, 0.0, 1.0]), least, whole)
-        _reweigh(steps, everywhere, whole, weights)
-    near = _with_neighbours(np.bincount(cells, minlength=columns * rows).astype(np.float64).reshape(columns, rows, 1))
-    fits = np.empty((columns * rows, 6))
+        _sum(base, weights, everywhere, sums[:1])
+        _fit(sums[:1], one, same, least, whole)
+        _reweigh(base, everywhere, whole, exact, weights)
     for _ in range(_ROUNDS):
-        sums = _sums(steps, weights, cells, columns * rows).reshape(columns, rows, _MOMENTS)
-        fits[:] = whole[0]
-        _fit(_with_neighbours(sums).reshape(-1, _MOMENTS), near.ravel(), whole[0, :4], least, fits)
-        _reweigh(steps, cells, fits, weights)
-    for row in range(len(maps)):
+        _sum(base, weights, cells, sums)
+        _add_neighbours(sums, columns, rows)
+        _fit(sums, near, whole[0], least, fits)
+        _reweigh(base, cells, fits, exact, weights)
+    for row in range(begin, end):
         column = min(max(int((points0[row, 0] - low_x) / width), 0), columns - 1)
         line = min(max(int((points0[row, 1] - low_y) / width), 0), rows - 1)
-        maps[row] = fits[column * rows + line, :4]
-    return maps
+        for entry in range(4):
+            maps[row, entry] = fits[column * rows + line, entry]
 
 
 @compiled
-def _sums(steps: np.ndarray, weights: np.ndarray, cells: np.ndarray, count: int) -> np.ndarray:
-    """Weighted moments (count, 12) of the points (M, 4) in every cell: up to first order, then x x, x y, ..., v y."""
-    sums = np.zeros((count, _MOMENTS))
-    for row in range(len(steps)):
-        weight, x, y, u, v = weights[row], steps[row, 0], steps[row, 1], steps[row, 2], steps[row, 3]
-        here = sums[cells[row]]
+def _sum(base: np.ndarray, weights: np.ndarray, cells: np.ndarray, sums: np.ndarray) -> None:
+    """Weighted moments (n, 12) of the points (M, 4) in every cell: up to first order, then x x, x y, y y, u x, ..."""
+    for cell in range(len(sums)):
+        for entry in range(_MOMENTS):
+            sums[cell, entry] = 0.0
+    for row in range(len(base)):
+        here, weight = sums[cells[row]], weights[row]
+        x, y, u, v = base[row, 0], base[row, 1], base[row, 2], base[row, 3]
         here[0] += weight
         here[1] += weight * x
         here[2] += weight * y
@@ -94,67 +106,63 @@ def _sums(steps: np.ndarray, weights: np.ndarray, cells: np.ndarray, count: int)
         here[9] += weight * u * y
         here[10] += weight * v * x
         here[11] += weight * v * y
-    return sums
 
 
 @compiled
-def _with_neighbours(cells: np.ndarray) -> np.ndarray:
-    """The sum (columns, rows, n) over every cell and the eight around it, those at a side by half, at a corner less."""
-    columns, rows, width = cells.shape
-    along, result = cells.copy(), np.empty_like(cells)
-    for column in range(columns):
-        for row in range(rows):
-            for entry in range(width):
-                if row > 0:
-                    along[column, row, entry] += 0.5 * cells[column, row - 1, entry]
-                if row < rows - 1:
-                    along[column, row, entry] += 0.5 * cells[column, row + 1, entry]
-    result[:] = along
-    for column in range(columns):
-        for row in range(rows):
-            for entry in range(width):
-                if column > 0:
-                    result[column, row, entry] += 0.5 * along[column - 1, row, entry]
-                if column < columns - 1:
-                    result[column, row, entry] += 0.5 * along[column + 1, row, entry]
-    return result
+def _add_neighbours(cells: np.ndarray, columns: int, rows: int) -> None:
+    """Add to every cell (columns * rows, n) those around it: at a side by half, at a corner by a quarter."""
+    for step, lines, length in ((1, columns, rows), (rows, rows, columns)):
+        for line in range(lines):
+            first = line * (rows if step == 1 else 1)
+            for entry in range(cells.shape[1]):
+                before = 0.0
+                for place in range(length):
+                    cell = first + place * step
+                    here = cells[cell, entry]
+                    after = cells[cell + step, entry] if place < length - 1 else 0.0
+                    cells[cell, entry] = here + 0.5 * (before + after)
+                    before = here
 
 
 @compiled
 def _fit(sums: np.ndarray, near: np.ndarray, prior: np.ndarray, least: float, fits: np.ndarray) -> None:
-    """Affine maps (n, 6), the linear part first, of the moments (n, 12); those without points stay as they are.
+    """Affine maps (n, 6) of moments (n, 12).
 
-    Args: near: (n,) how many points each has. prior: the linear part that all are drawn to. least: spread in squared
-        pixels below which they follow it.
+    Args: near: (n, 1) how many points each has. prior: (6,) the map that all are drawn to, and have where there is no
+        point. least: spread in squared pixels below which they follow its linear part.
     """
-    for row in range(len(sums)):
-        total = sums[row, 0]
+    for cell in range(len(sums)):
+        total = sums[cell, 0]
         if total <= 0:
+            for entry in range(_MAP):
+                fits[cell, entry] = prior[entry]
             continue
-        x, y, u, v = sums[row, 1] / total, sums[row, 2] / total, sums[row, 3] / total, sums[row, 4] / total
-        xx, xy, yy = sums[row, 5] / total - x * x, sums[row, 6] / total - x * y, sums[row, 7] / total - y * y
-        pull = _PULL * max(xx + yy, 0.0) / near[row] + least
+        x, y = sums[cell, 1] / total, sums[cell, 2] / total
+        xx, xy, yy = sums[cell, 5] / total - x * x, sums[cell, 6] / total - x * y, sums[cell, 7] / total - y * y
+        pull = _PULL * max(xx + yy, 0.0) / near[cell, 0] + least
         xx, yy = max(xx, 0.0) + pull, max(yy, 0.0) + pull
         inverse = 1 / (xx * yy - xy * xy)
         for axis in range(2):
-            there = v if axis else u
-            along = sums[row, 8 + 2 * axis] / total - there * x + pull * prior[2 * axis]
-            across = sums[row, 9 + 2 * axis] / total - there * y + pull * prior[2 * axis + 1]
-            fits[row, 2 * axis] = (along * yy - across * xy) * inverse
-            fits[row, 2 * axis + 1] = (across * xx - along * xy) * inverse
-            fits[row, 4 + axis] = there - fits[row, 2 * axis] * x - fits[row, 2 * axis + 1] * y
+            there = sums[cell, 3 + axis] / total
+            along = sums[cell, 8 + 2 * axis] / total - there * x + pull * prior[2 * axis]
+            across = sums[cell, 9 + 2 * axis] / total - there * y + pull * prior[2 * axis + 1]
+            a, b = (along * yy - across * xy) * inverse, (across * xx - along * xy) * inverse
+            fits[cell, 2 * axis], fits[cell, 2 * axis + 1], fits[cell, 4 + axis] = a, b, there - a * x - b * y
 
 
 @compiled
-def _reweigh(steps: np.ndarray, cells: np.ndarray, fits: np.ndarray, weights: np.ndarray) -> None:
-    """Let points (M, 4) that disagree with the map of their cell weigh less, against the median of all."""
-    squared = np.empty(len(steps))
-    for row in range(len(steps)):
-        fit, x, y = fits[cells[row]], steps[row, 0], steps[row, 1]
-        off_x = steps[row, 2] - fit[0] * x - fit[1] * y - fit[4]
-        off_y = steps[row, 3] - fit[2] * x - fit[3] * y - fit[5]
-        squared[row] = off_x**2 + off_y**2
-    half = len(steps) // 2
-    scale = 1 / max(np.partition(squared, half)[half], 1e-18)
-    for row in range(len(steps)):
-        weights[row] = 1 / (1 + squared[row] * scale)
+def _reweigh(base: np.ndarray, cells: np.ndarray, fits: np.ndarray, exact: float, weights: np.ndarray) -> None:
+    """Let points (M, 4) that disagree with the map of their cell weigh less.
+
+    As if residuals were of a Cauchy distribution: its squared scale is the geometric mean of their squares.
+    """
+    logs = 0.0
+    for row in range(len(base)):
+        fit, x, y = fits[cells[row]], base[row, 0], base[row, 1]
+        off_x = base[row, 2] - fit[0] * x - fit[1] * y - fit[4]
+        off_y = base[row, 3] - fit[2] * x - fit[3] * y - fit[5]
+        weights[row] = max(off_x**2 + off_y**2, exact)
+        logs += np.log(weights[row])
+    scale = np.exp(logs / len(base))
+    for row in range(len(base)):
+        weights[row] = scale / (scale + weights[row])

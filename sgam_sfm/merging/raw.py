@@ -10,7 +10,7 @@ import numpy as np
 
 from sgam_core.errors import InputError, ShapeError
 from sgam_core.types import Matches
-from sgam_sfm.merging.affine import affine_maps
+from sgam_sfm.merging.affine import fit_maps
 from sgam_sfm.merging.compiled import compiled
 from sgam_sfm.merging.scratch import Rows, Scratch, batches
 from sgam_sfm.pairs import Pair
@@ -102,25 +102,22 @@ def _rows_of(batch: list[RawPair]) -> tuple[list[tuple[Pair, int]], np.ndarray]:
     rows[:, 0:2], rows[:, 2:4] = joined.points0, joined.points1
     rows[:, 4], rows[:, 5], rows[:, SCORE] = joined.sigmas0, joined.sigmas1, joined.scores
     ends = np.cumsum([count for _, count in told])
-    _add_maps(rows, joined.points0, joined.points1, np.concatenate(masks), ends)
+    trusted = np.concatenate(masks)
+    rows[:, AFFINE] = maps = _maps(joined.points0, joined.points1, trusted, ends)
+    determinants = maps[:, 0] * maps[:, 3] - maps[:, 1] * maps[:, 2]
+    variances = joined.sigmas1.astype(np.float64) ** 2 + np.abs(determinants) * joined.sigmas0**2
+    rows[:, VARIANCE] = np.where(trusted, variances, -variances)
     return told, rows
 
 
 @compiled
-def _add_maps(
-    rows: np.ndarray, points0: np.ndarray, points1: np.ndarray, trusted: np.ndarray, ends: np.ndarray
-) -> None:
-    """Fill in the local maps of matches, pair by pair, and the variances that follow."""
-    begin = 0
+def _maps(points0: np.ndarray, points1: np.ndarray, trusted: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """The local maps (M, 4) of matches. Args: ends: of the matches of every pair."""
+    maps, begin = np.empty((len(points0), 4)), 0
     for end in ends:
-        maps = affine_maps(points0[begin:end], points1[begin:end], trusted[begin:end])
-        rows[begin:end, 8:12] = maps
-        for row in range(begin, end):
-            a, b, c, d = maps[row - begin]
-            sigma0, sigma1 = np.float64(rows[row, 4]), np.float64(rows[row, 5])
-            variance = sigma1**2 + abs(a * d - b * c) * sigma0**2
-            rows[row, 7] = variance if trusted[row] else -variance
+        fit_maps(points0, points1, trusted, begin, end, maps)
         begin = end
+    return maps
 
 
 def weights_of(rows: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from sgam_sfm.merging.compiled import compiled
 
-_FEW = 32  # to insert one by one
+_FEW = 200  # to insert one by one
 
 
 def stable_order(values: np.ndarray) -> np.ndarray:
@@ -20,24 +20,23 @@ def stable_order(values: np.ndarray) -> np.ndarray:
         if int(values.max()) - low < 2**16:
             return np.argsort((values - low).astype(np.uint16), kind="stable")
     order = np.argsort(values)
-    _order_equal(values[order], order)
-    return order
+    return order if _order_equal(values[order], order) else np.argsort(values, kind="stable")
 
 
 @compiled
-def _order_equal(values: np.ndarray, order: np.ndarray) -> None:
-    """Sort those of an order (N,) whose values (N,), which are sorted, are equal."""
+def _order_equal(values: np.ndarray, order: np.ndarray) -> bool:
+    """Sort those of an order (N,) whose values (N,), which are sorted, are equal; False where there are too many."""
     begin = 0
     for end in range(1, len(order) + 1):
         if end < len(order) and values[end] == values[begin]:
             continue
         if end - begin > _FEW:
-            order[begin:end].sort()
-        else:
-            for place in range(begin + 1, end):
-                row, slot = order[place], place
-                while slot > begin and order[slot - 1] > row:
-                    order[slot] = order[slot - 1]
-                    slot -= 1
-                order[slot] = row
+            return False
+        for place in range(begin + 1, end):
+            row, slot = order[place], place
+            while slot > begin and order[slot - 1] > row:
+                order[slot] = order[slot - 1]
+                slot -= 1
+            order[slot] = row
         begin = end
+    return True
