@@ -11,7 +11,8 @@ from __future__ import annotations
 from dataclasses import replace
 from operator import itemgetter
 
-from scipy.stats import hypergeom
+import numpy as np
+from scipy.special import gammaln
 
 from sgam_core.covisible import Frame, enclosing_box
 from sgam_core.options import GuidanceOptions
@@ -48,7 +49,7 @@ def _judged(
 ) -> tuple[float, AreaMatch]:
     """The probability of chance, and the area pair with its state. Args: frames: the images of what is to be cut."""
     joined, leaving, arriving = _counts(area, matches)
-    chance = float(hypergeom.sf(joined - 1, len(matches), arriving, leaving)) if joined else 1.0
+    chance = chance_of(joined, leaving, arriving, len(matches))
     if joined >= _FEWEST and max(leaving, arriving) >= _ALL * len(matches):
         chance = options.max_chance  # one image shows the other's area from near: chance tells nothing, overlap may
     if chance > options.max_chance:
@@ -61,6 +62,21 @@ def _judged(
         reason = f"its areas share {joined} of {leaving} and {arriving} whole-image matches: they overlap in part"
         return chance, _skipped(area, reason)
     return chance, area
+
+
+def chance_of(joined: int, leaving: int, arriving: int, count: int) -> float:
+    """The probability that of `count` matches at least so many both leave and arrive by chance (Fisher's exact test).
+
+    The sum that `scipy.stats.hypergeom.sf` gives; importing that takes a third of the time in which a command starts.
+    """
+    shared = np.arange(joined, min(leaving, arriving) + 1)
+    logs = _log_ways(arriving, shared) + _log_ways(count - arriving, leaving - shared) - _log_ways(count, leaving)
+    return min(float(np.exp(logs).sum()), 1.0)
+
+
+def _log_ways(number: int, chosen: np.ndarray | int) -> np.ndarray:
+    """Of the ways to choose some of a number of things the logarithm; minus infinity where there are none."""
+    return np.asarray(gammaln(number + 1) - gammaln(chosen + 1) - gammaln(number - chosen + 1))
 
 
 def _counts(area: AreaMatch, matches: Matches) -> tuple[int, int, int]:

@@ -65,7 +65,7 @@ class CoSeg:
         seed: int = 0,
         num_labels: int | None = None,
         cache_folder: Path | None = None,
-        image_size: int = 644,
+        image_size: int = 518,
         threads: int = 0,
     ) -> None:
         if num_labels is not None and not 2 <= num_labels <= 255:

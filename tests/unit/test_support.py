@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import hypergeom
 
 from sgam_core.covisible import Frame
 from sgam_core.options import GuidanceOptions
-from sgam_core.support import supported
+from sgam_core.support import chance_of, supported
 from sgam_core.types import Area, AreaMatch, AreaState, Box, Matches, PutativeAreas
 
 LEFT, RIGHT = Box(x0=0, y0=0, x1=50, y1=100), Box(x0=50, y0=0, x1=100, y1=100)
@@ -125,3 +126,12 @@ def test_a_cut_area_lies_inside_the_whole_one(seed, joined, wrong):
     shared = [area.area0.box.contains(found.points0) & area.area1.box.contains(found.points1) for area in (pair, cut)]
     assert not (shared[1] & ~shared[0]).any()
     assert shared[1].sum() >= 0.8 * shared[0].sum()  # 2 % are left out at each of its four sides, in both images
+
+
+@given(st.data())
+def test_chance_is_the_tail_of_the_hypergeometric_distribution(data):
+    count = data.draw(st.integers(0, 5000))
+    leaving, arriving = data.draw(st.integers(0, count)), data.draw(st.integers(0, count))
+    joined = data.draw(st.integers(0, min(leaving, arriving)))
+    expected = float(hypergeom.sf(joined - 1, count, arriving, leaving)) if count else 1.0
+    assert chance_of(joined, leaving, arriving, count) == pytest.approx(expected, rel=1e-8, abs=1e-300)
