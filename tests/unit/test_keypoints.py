@@ -250,3 +250,17 @@ def test_local_maps_are_exact_for_matches_in_the_order_of_a_grid():
     warp = similarity(1.15, 8, (6.4, -3.3), (160, 120))
     maps = local_affine(spots, transfer(warp, spots), np.ones(len(spots), bool))
     np.testing.assert_allclose(maps, np.broadcast_to(warp[:2, :2], maps.shape), atol=5e-3)
+
+
+def test_a_match_far_from_all_trusted_ones_follows_the_map_of_the_whole_pair():
+    points0, turn = np.random.default_rng(0).uniform(0, 1000, (400, 2)), np.array([[0.0, -1.5], [1.5, 0.0]])
+    points0[0] = 500
+    trusted = np.linalg.norm(points0 - 500, axis=1) > 300
+    points1 = np.where(trusted[:, None], points0 @ turn.T + 5, 0)
+    np.testing.assert_allclose(local_affine(points0, points1, trusted)[0], turn, atol=0.01)
+
+
+def test_local_maps_of_coinciding_and_of_collinear_matches_are_finite():
+    for points in (np.full((20, 2), 7.0), np.column_stack([np.arange(20.0), np.full(20, 3.0)])):
+        maps = local_affine(points, points + 4, np.ones(20, bool))
+        np.testing.assert_allclose(maps, np.broadcast_to(np.eye(2), maps.shape), atol=1e-6)

@@ -17,6 +17,7 @@ def test_rows_are_read_as_they_were_written_and_the_folder_goes_even_after_an_er
         np.testing.assert_array_equal(rows.read(1, 1), [[3, 4]])
         np.testing.assert_array_equal(rows.read(4, 1), [[9, 8]])
         assert rows.read(1, 0).shape == (0, 2)
+        np.testing.assert_array_equal(rows.read_parts([(4, 1), (0, 0), (0, 2)]), [[9, 8], [1, 2], [3, 4]])
         assert [path.name for path in folder.iterdir()] == ["points"]
     assert not folder.exists()
     with pytest.raises(RuntimeError), Scratch(folder):
