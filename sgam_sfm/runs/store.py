@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import logging
 import math
 from collections.abc import Iterator, Sequence
@@ -29,7 +28,7 @@ from typing import Any
 import h5py
 import numpy as np
 from pydantic import TypeAdapter
-from pydantic_core import from_json, to_jsonable_python
+from pydantic_core import from_json, to_json
 
 from sgam_core import AreaMatch, Matches, PairResult, TwoViewModel
 from sgam_core.errors import InputError, SGAMError
@@ -164,7 +163,7 @@ def _write_records(file: h5py.File, records: Sequence[PairRecord]) -> None:
         for record in records
     ]
     parts = [Matches.empty() if record.result is None else record.result.matches for record in records]
-    file.create_dataset("facts", data=np.frombuffer(json.dumps(told).encode(), np.uint8))
+    file.create_dataset("facts", data=np.frombuffer(to_json(told), np.uint8))
     file.create_dataset("ends", data=np.cumsum([len(part) for part in parts], dtype=np.int64))
     joined = Matches.concatenate(parts)
     for name in _ARRAYS:
@@ -182,8 +181,7 @@ def _facts(result: PairResult) -> dict[str, Any]:
     two_view = None if model is None else {name: getattr(model, name) for name in TwoViewModel.__slots__}
     if two_view is not None:
         two_view["F"] = model.F.tolist()  # type: ignore[union-attr]
-    facts |= {"areas": _AREAS.dump_python(result.areas, mode="json"), "two_view": two_view}
-    return to_jsonable_python(facts)
+    return facts | {"areas": _AREAS.dump_python(result.areas, mode="json"), "two_view": two_view}
 
 
 def _read_records(file: h5py.File) -> Iterator[PairRecord]:
