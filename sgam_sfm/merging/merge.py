@@ -36,6 +36,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from sgam_core.errors import InputError
 from sgam_core.types import Matches
 from sgam_sfm.merging.clusters import finest_and_weight, merge_image
 from sgam_sfm.merging.compiled import compiled
@@ -51,6 +52,7 @@ from sgam_sfm.threads import in_order
 _log = logging.getLogger(__name__)
 
 _FOLDER = ".merging"
+_MOST_KEYPOINTS = 2**31 - 1  # that have a number
 _OCTAVE = 2.0  # points whose sigma is so many times the finest have no say in where a keypoint lies
 
 Key = TypeVar("Key")
@@ -86,8 +88,8 @@ def merge_keypoints(
         options: the defaults when None. inliers: (M,) bool for some or all pairs, which matches agree with the pair's
         robust geometry; the others join tracks last.
     Returns: keypoints of every image of the pairs and matches of every pair; the order of the mapping does not matter.
-    Raises: InputError when a pair holds one image twice or comes in both orders; ShapeError for a mask that does not
-        fit its matches.
+    Raises: InputError when a pair holds one image twice or comes in both orders, or for more keypoints than have
+        numbers; ShapeError for a mask that does not fit its matches.
     """
     raw = ((pair, pairs[pair], (inliers or {}).get(pair)) for pair in pairs)
     with tempfile.TemporaryDirectory() as folder, merging(raw, Path(folder), options) as merged:
@@ -171,6 +173,11 @@ def _merge_images(raw: RawMatches, radius_px: float, scratch: Scratch) -> tuple[
             begin_of_labels += count
         told.append(keypoints)
         bounds[image + 1] = told.count
+        if told.count > _MOST_KEYPOINTS:
+            raise InputError(
+                f"matches have more than {_MOST_KEYPOINTS} keypoints in {image + 1} of {len(raw.names)} images; match "
+                "the collection in parts, or with fewer matches (--preset fast)"
+            )
     return bounds, told
 
 

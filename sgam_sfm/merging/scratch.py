@@ -100,8 +100,8 @@ class Sorted:
         """Add rows (n, width) under labels (n,)."""
         if not len(rows):
             return
-        self._waiting.append((labels, np.ascontiguousarray(rows, self._dtype)))
-        self._bytes += rows.nbytes
+        self._waiting.append((labels.astype(np.int32), np.ascontiguousarray(rows, self._dtype)))
+        self._bytes += sum(part.nbytes for part in self._waiting[-1])
         if self._bytes > _BUFFERED:
             self._flush()
 

@@ -264,3 +264,9 @@ def test_local_maps_of_coinciding_and_of_collinear_matches_are_finite():
     for points in (np.full((20, 2), 7.0), np.column_stack([np.arange(20.0), np.full(20, 3.0)])):
         maps = local_affine(points, points + 4, np.ones(20, bool))
         np.testing.assert_allclose(maps, np.broadcast_to(np.eye(2), maps.shape), atol=1e-6)
+
+
+def test_more_keypoints_than_have_numbers_are_told(monkeypatch):
+    monkeypatch.setattr("sgam_sfm.merging.merge._MOST_KEYPOINTS", 2)
+    with pytest.raises(InputError, match=r"^matches have more than 2 keypoints in 2 of 2 images; match the"):
+        merge_keypoints({("a", "b"): matches(A, B)})
