@@ -63,16 +63,12 @@ class Tracks:
         self._rows[here, _LINK] = np.arange(here.start, here.stop)
         self._values[here, _X : _Y + 1], self._values[here, _SIGMA] = points, sigmas
 
-    def track(self, keypoints: np.ndarray | None = None) -> Int[np.ndarray, " K"]:
-        """The keypoint that gives each of some keypoints' track its number; of all when left out."""
-        return _roots(self._rows, np.arange(len(self._rows)) if keypoints is None else keypoints)
-
-    def representative(self, keypoints: np.ndarray | None = None) -> Int[np.ndarray, " K"]:
-        """The keypoint of the same image and track that each has become part of, itself for most."""
-        return _standing(self._rows, np.arange(len(self._rows)) if keypoints is None else keypoints)
-
     def linked(self, index: Int[np.ndarray, "M 2"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The matches whose keypoints are in one track: their rows, standing keypoints (L, 2), track of each."""
+        """The matches whose keypoints are in one track.
+
+        Returns: their rows (L,); the keypoints (L, 2) that theirs have become part of, themselves for most; the track
+        of each (L,), by the keypoint that gives it its number.
+        """
         return _linked(self._rows, index)
 
     def offsets(
@@ -173,29 +169,10 @@ def _root(rows: np.ndarray, keypoint: int) -> int:
 
 
 @compiled
-def _roots(rows: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
-    found = np.empty(len(keypoints), np.int64)
-    for place in range(len(keypoints)):
-        root = keypoints[place]
-        while rows[root, _PARENT] >= 0:
-            root = rows[root, _PARENT]
-        found[place] = root
-    return found
-
-
-@compiled
 def _stands(rows: np.ndarray, keypoint: int) -> int:
     while rows[keypoint, _IMAGE] < 0:
         keypoint = rows[keypoint, _LINK]
     return keypoint
-
-
-@compiled
-def _standing(rows: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
-    found = np.empty(len(keypoints), np.int64)
-    for place in range(len(keypoints)):
-        found[place] = _stands(rows, keypoints[place])
-    return found
 
 
 @compiled

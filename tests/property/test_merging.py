@@ -171,5 +171,7 @@ def test_joining_is_what_it_says(seed, most_rearranged):
         made.join_tracks(np.array_split(edges[half:], 2), min_shared=1)
     needed = [(a, b, int(row >= half)) for row, (a, b) in enumerate(edges.tolist())]
     root, stands = one_after_the_other(points, images, sigmas, needed, radius)
-    np.testing.assert_array_equal(made.track(), root)
-    np.testing.assert_array_equal(made.representative(), stands)
+    kept, standing, track = made.linked(np.repeat(np.arange(count)[:, None], 2, axis=1))
+    np.testing.assert_array_equal(kept, np.arange(count))
+    np.testing.assert_array_equal(track, root)
+    np.testing.assert_array_equal(standing, np.column_stack([stands, stands]))

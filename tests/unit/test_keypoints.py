@@ -153,8 +153,9 @@ def test_a_track_keeps_the_finer_of_two_keypoints_that_become_one():
     points = np.array([[10.0, 10.0], [12.0, 10.0], [50.0, 50.0]])
     tracks = Tracks(points, np.array([0, 0, 1]), np.array([3.0, 1.0, 1.0]), 1.0)
     tracks.join(np.array([[0, 2], [1, 2]]))
-    assert len(set(tracks.track().tolist())) == 1
-    np.testing.assert_array_equal(tracks.representative(), [1, 1, 2])
+    _, standing, track = tracks.linked(np.repeat([[0], [1], [2]], 2, axis=1))
+    assert len(set(track.tolist())) == 1
+    np.testing.assert_array_equal(standing, [[1, 1], [1, 1], [2, 2]])
 
 
 def test_a_match_far_from_its_aligned_keypoints_is_dropped():
