@@ -60,8 +60,7 @@ def _cluster(points: np.ndarray, weights: np.ndarray, radius: float) -> tuple[np
     densest = stable_order(-_density(spots, frame, start, radius))
     seed_of, count = _nearest_seeds(spots, densest, frame, start, radius)
     labels = seed_of[spot_of]
-    means, _ = _means(labels, points, weights, count)
-    return means, labels
+    return _means(labels, points, weights, count), labels
 
 
 @compiled
@@ -150,7 +149,7 @@ def _nearest_seeds(
 
 
 @compiled
-def _means(labels: np.ndarray, points: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _means(labels: np.ndarray, points: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
     sums, total = np.zeros((count, 2)), np.zeros(count)
     for row in range(len(labels)):
         total[labels[row]] += weights[row]
@@ -158,7 +157,7 @@ def _means(labels: np.ndarray, points: np.ndarray, weights: np.ndarray, count: i
         sums[labels[row], 1] += weights[row] * points[row, 1]
     for label in range(count):
         sums[label] /= total[label]
-    return sums, total
+    return sums
 
 
 @compiled

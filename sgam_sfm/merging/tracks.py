@@ -157,10 +157,17 @@ class Tracks:
 
 
 @compiled
+def _seen_root(rows: np.ndarray, keypoint: int) -> int:
+    """The root of a keypoint, nothing changed: threads may ask."""
+    while rows[keypoint, _PARENT] >= 0:
+        keypoint = rows[keypoint, _PARENT]
+    return keypoint
+
+
+@compiled
 def _root(rows: np.ndarray, keypoint: int) -> int:
-    root = keypoint
-    while rows[root, _PARENT] >= 0:
-        root = rows[root, _PARENT]
+    """The same, and a shorter way to it from now on."""
+    root = _seen_root(rows, keypoint)
     while keypoint != root:
         above = rows[keypoint, _PARENT]
         rows[keypoint, _PARENT] = root
@@ -180,12 +187,8 @@ def _linked(rows: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray
     kept, standing = np.empty(len(index), np.int64), np.empty((len(index), 2), np.int64)
     tracks, count = np.empty(len(index), np.int64), 0
     for row in range(len(index)):
-        root, other = np.int64(index[row, 0]), np.int64(index[row, 1])
-        while rows[root, _PARENT] >= 0:
-            root = rows[root, _PARENT]
-        while rows[other, _PARENT] >= 0:
-            other = rows[other, _PARENT]
-        if root == other:
+        root = _seen_root(rows, index[row, 0])
+        if root == _seen_root(rows, index[row, 1]):
             kept[count], tracks[count] = row, root
             standing[count, 0], standing[count, 1] = _stands(rows, index[row, 0]), _stands(rows, index[row, 1])
             count += 1
@@ -347,10 +350,7 @@ def _near_tracks(
             continue
         coarsest = max(coarsest, np.float64(values[keypoint, _SIGMA]))
         points[count, 0], points[count, 1] = values[keypoint, _X], values[keypoint, _Y]
-        root = keypoint
-        while rows[root, _PARENT] >= 0:
-            root = rows[root, _PARENT]
-        standing[count], roots[count] = keypoint, root
+        standing[count], roots[count] = keypoint, _seen_root(rows, keypoint)
         count += 1
     points = points[:count]
     widest = radius * coarsest
